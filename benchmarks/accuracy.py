@@ -35,9 +35,10 @@ from pathlib import Path
 import accuracy_table as table
 import cv2
 import numpy as np
-from accuracy_jobs import Job, Result, Row, Setup, Workers, picture_of
+from accuracy_jobs import Job, Result, Row, Setup, Work, failure, picture_of
 
 import gftorf_warp
+from gftorf_warp.sweep.workers import Lost, Workers, places
 
 TUNING, VALIDATION = range(16), range(100, 116)
 SEEDS = (0, 1, 2)
@@ -75,19 +76,24 @@ def main(arguments: list[str] | None = None) -> int:
         for job in scenes
         for row in options.rows
     ]
-    workers, left = Workers(options.workers, setup), 0
-    for jobs in (scenes, fits):
-        done = 0
-        for _, result in workers.results(jobs, known, begun + options.limit):
-            done += 1
-            if result is not None:
-                result["source"] = source
-                stored[result["id"]] = result
-                with store.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(result) + "\n")
-                _report(done, len(jobs), result, begun)
-        left += len(jobs) - done
-    workers.close()
+    left = 0
+    with Workers(places([options.device], options.workers), Work(setup)) as workers:
+        for jobs in (scenes, fits):
+            done = 0
+            tasks = [(job, known.get(job.id(setup))) for job in jobs]
+            for (job, _), outcome in workers.outcomes(
+                tasks, tries=1, deadline=begun + options.limit
+            ):
+                done += 1
+                lost = isinstance(outcome, Lost)
+                result = failure(job, setup, outcome.why) if lost else outcome
+                if result is not None:
+                    result["source"] = source
+                    stored[result["id"]] = result
+                    with store.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(result) + "\n")
+                    _report(done, len(jobs), result, begun)
+            left += len(jobs) - done
     text = "\n".join(_tables(title, names, options, setup, stored) for title, names in sets.items())
     if left:
         text += f"\n{left} jobs are left: the same command continues.\n"

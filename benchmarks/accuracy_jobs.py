@@ -11,18 +11,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import logging
-import math
-import multiprocessing
-import os
 import shutil
 import time
 import traceback
-from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +42,9 @@ from gftorf_warp.scene.changes import changed
 from gftorf_warp.sim.exposure import pooled as averaged
 from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.random_scene import random_scene
+from gftorf_warp.sweep.workers import Place
 
 Result = dict[str, Any]
-GRACE = 40.0  # [s]
 RAYS = 4  # per pixel and axis, of the edge floor
 CAPTION, PANEL = 16, 240  # [px] height of the text above a picture, least width of each of its four
 
@@ -97,8 +90,6 @@ class Setup:
     finer: Path | None = None
     """Folder with given sequences of the same names at a multiple of their size, for their edge
     floor; None: they have none."""
-    protocol: str = "all"
-    """Which raw frames are scored, as ``gftorf compare --frames`` takes it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +212,7 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
     if kind == "cuda":
         torch.cuda.reset_peak_memory_stats()
     run = reconstruct(sequence, folder, settings, seed=job.seed, device=setup.device)
-    scores = compare(run, frames=setup.protocol, report=False)
+    scores = compare(run, report=False)
     _draw(job, setup, run, sequence, scores)
     result = {
         "row": job.row.name,
@@ -302,94 +293,30 @@ def _hash(*values: object) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-class Workers:
-    """Processes that do jobs, each with its share of the CPUs.
+@dataclass(frozen=True)
+class Work:
+    """What a process does with (job, key of its known result): None if there is nothing to do."""
 
-    Args:
-        count: Number of processes.
-        setup: Of all jobs.
-    """
+    setup: Setup
+    """Of all jobs."""
 
-    def __init__(self, count: int, setup: Setup):
-        self.setup, self.count = setup, count
-        self._context = multiprocessing.get_context("spawn")  # CUDA does not survive a fork
-        self._idle: list[tuple[Connection, Any]] = []
-        self._started = 0
-
-    def results(
-        self, jobs: list[Job], known: dict[str, str], deadline: float
-    ) -> Iterator[tuple[Job, Result | None]]:
-        """Results in the order in which they are ready; None: nothing had to be done.
-
-        No job begins after ``deadline`` on the monotonic clock [s], and processes that are not
-        ready ``GRACE`` later are killed.
-        """
-        waiting, busy = deque(jobs), {}
-        while waiting or busy:
-            while waiting and len(busy) < self.count and time.monotonic() < deadline:
-                connection, process = self._idle.pop() if self._idle else self._start()
-                job = waiting.popleft()
-                connection.send((job, known.get(job.id(self.setup))))
-                busy[connection] = process, job
-            if not busy:
-                return
-            left = None if math.isinf(deadline) else deadline + GRACE - time.monotonic()
-            ready = wait(list(busy), None if left is None else max(left, 0.0))
-            if not ready:
-                for process, _ in busy.values():
-                    process.kill()
-                return
-            for connection in ready:
-                process, job = busy.pop(connection)
-                try:
-                    result = connection.recv()
-                    self._idle.append((connection, process))
-                except (EOFError, OSError):
-                    process.join()
-                    why = f"the process ended with exit code {process.exitcode}"
-                    result = failure(job, self.setup, why)
-                yield job, result
-
-    def _start(self) -> tuple[Connection, Any]:
-        ours, theirs = self._context.Pipe()
-        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        share = cpus[self._started % self.count :: self.count]
-        process = self._context.Process(target=serve, args=(theirs, self.setup, share), daemon=True)
-        process.start()
-        theirs.close()
-        self._started += 1
-        return ours, process
-
-    def close(self) -> None:
-        """End all processes; they are idle."""
-        for connection, process in self._idle:
-            connection.send(None)
-            process.join()
-        self._idle.clear()
+    def __call__(self, task: tuple[Job, str | None], place: Place) -> Result | None:
+        """Do a job; if it fails, its result is the error."""
+        torch.set_num_threads(max(len(place.cpus), 1))
+        cv2.setNumThreads(max(len(place.cpus), 1))
+        wp.config.log_level = wp.LOG_ERROR
+        job, known = task
+        try:
+            return result_of(job, self.setup, known)
+        except GftorfError as error:
+            why = " ".join(f"{type(error).__name__}: {error}".split())
+        except Exception as error:  # a job never ends the benchmark
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            why = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        return failure(job, self.setup, why)
 
 
 def failure(job: Job, setup: Setup, why: str) -> Result:
     """The result of a job that failed."""
     row = {} if job.row is None else {"row": job.row.name}
     return {"id": job.id(setup), "scene": job.title, "seed": job.seed, **row, "error": why}
-
-
-def serve(connection: Connection, setup: Setup, cpus: list[int]) -> None:
-    """Do jobs until None comes."""
-    if cpus:
-        os.sched_setaffinity(0, cpus)
-    torch.set_num_threads(max(len(cpus), 1))
-    cv2.setNumThreads(max(len(cpus), 1))
-    wp.config.log_level = wp.LOG_ERROR
-    logging.getLogger("gftorf_warp").setLevel(logging.ERROR)
-    while (task := connection.recv()) is not None:
-        job, known = task
-        try:
-            result = result_of(job, setup, known)
-        except GftorfError as error:
-            result = failure(job, setup, " ".join(f"{type(error).__name__}: {error}".split()))
-        except Exception as error:  # a job never ends the benchmark
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            why = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
-            result = failure(job, setup, why)
-        connection.send(result)

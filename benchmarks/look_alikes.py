@@ -2,7 +2,7 @@
 
     python benchmarks/look_alikes.py [--group synthetic|recorded|carried|all] [--rays 2] [--json
     FILE]
-    python benchmarks/look_alikes.py --reconstruct OUT ...    fits, see look_alikes_fits.py --help
+    python benchmarks/look_alikes.py --reconstruct OUT [options of gftorf sweep]
 
 Ideal quads from analytic first hits: one centre ray per pixel (or --rays x --rays), instantaneous
 exposure, no noise, direct light. Protocol ftorf13: first raw frame of every quartet but the first
@@ -11,6 +11,8 @@ from the truth [m^2 x 100]; no cyclic distance, so that a wrapped pixel costs up
 recordings are scored on the same 13 quartets, carried cameras on every third quartet from the third
 on. Truth is that of the first raw frame of the quartet, or, "mid", half a quartet (1.5 raw frames)
 later. Columns differ in the sensor too: one tap (dc 1) or two (dc 0), and the shifts in time order.
+
+With --reconstruct the presets of look_alikes.toml are fitted, `gftorf sweep` prints the table.
 
 Ours, then the recipe; accepted within 3 % or 0.002 (0.005 for carried cameras). Ends with 1 if a
 value is not.
@@ -36,6 +38,7 @@ from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.sensors import PALINDROMIC, SEQUENTIAL
 
 RELATIVE, ABSOLUTE = 0.03, 0.002
+PLAN = Path(__file__).with_suffix(".toml")  # of the fits
 TORF_ABSOLUTE = 0.005
 PAIRED, IN_TURN, REAL = CANONICAL_SHIFTS, SEQUENTIAL, PALINDROMIC
 
@@ -175,9 +178,10 @@ def accepted(ours: float, target: float, group: Group) -> bool:
 def main() -> int:
     """Print the table, write the JSON."""
     if "--reconstruct" in sys.argv[1:]:
-        import look_alikes_fits
+        from gftorf_warp.cli import main as gftorf
 
-        return look_alikes_fits.main([word for word in sys.argv[1:] if word != "--reconstruct"])
+        at = sys.argv.index("--reconstruct") + 1
+        return gftorf(["sweep", str(PLAN), "--out", *sys.argv[at:]])
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

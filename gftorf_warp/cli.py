@@ -13,6 +13,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import __version__
@@ -295,6 +296,31 @@ def _view(options: argparse.Namespace) -> int:
     return 0
 
 
+def _sweep(options: argparse.Namespace) -> int:
+    from .sweep.plan import read_plan
+
+    plan = read_plan(options.plan)
+    if options.dry_run:
+        print("\n".join(job.id for job in (*plan.recordings, *plan.fits)))
+        return 0
+    device = start(options)
+    from .sweep.command import TABLE, sweep
+    from .sweep.table import exit_code
+
+    given = _named(options, "out", "workers", "scheduler")
+    devices = _gpus() if device != "cpu" and ":" not in options.device else [device]
+    results = sweep(plan, **given, devices=devices, progress=_progress(options)("sweep"))
+    print((Path(options.out) / TABLE).read_text(encoding="utf-8"), end="")
+    return exit_code(results.values())
+
+
+def _gpus() -> list[str]:
+    """All GPUs of this machine."""
+    import torch
+
+    return [f"cuda:{k}" for k in range(torch.cuda.device_count())]
+
+
 def _opened(options: argparse.Namespace, device: str, path: str | None = None) -> Run:
     """The run of a command, or one of several, with its sequence where --sequence says."""
     from .recon.run import Run
@@ -371,6 +397,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
         _export,
         _compare,
         _view,
+        _sweep,
         _doctor,
         _bench,
     )

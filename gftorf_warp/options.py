@@ -282,6 +282,20 @@ def command_parsers() -> dict[str, Parser]:
     importer.flag("--template", "print such a file with comments, or write it to --out")
     importer.flag("--dry-run", "print what would be read and how, and write nothing")
 
+    sweep = Parser.of(
+        "sweep", "reconstruct and score scenes x presets x settings x seeds; goes on where it was"
+    )
+    plans = "TOML file: scenes, presets, seeds, settings, see docs/sweep.md"
+    sweep.add_argument("plan", metavar="FILE", help=plans)
+    sweep.option("--out", "DIR", str, "folder of runs and tables (gftorf-sweep)", "gftorf-sweep")
+    kinds = "auto (default), cpu, cuda for all GPUs; cuda:1 is the second one"
+    sweep.option("--device", "auto|cpu|cuda", _device, kinds, "auto")
+    processes = "processes (one per GPU, or per two CPUs)"
+    sweep.option("--workers", "K", _positive, processes)
+    addresses = "Dask scheduler, tcp://host:8786, whose workers do the jobs and see --out"
+    sweep.option("--scheduler", "ADDRESS", str, addresses)
+    sweep.flag("--dry-run", "list the jobs and do nothing")
+
     doctor = Parser.of(
         "doctor", "print versions and devices, and test the renderer on this machine"
     )
@@ -315,6 +329,7 @@ def command_parsers() -> dict[str, Parser]:
         export,
         compare,
         view,
+        sweep,
         doctor,
         bench,
     )

@@ -8,7 +8,6 @@ import os
 import sys
 import time
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 
 import cv2
@@ -20,12 +19,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import accuracy
 import accuracy_jobs
 import accuracy_table
-import look_alikes_fits
 
 from gftorf_warp import simulate
 from gftorf_warp.sim.random_scene import random_scene
 from gftorf_warp.sim.world import first_hit
+from gftorf_warp.sweep import workers
 
+PLACE = workers.Place("cpu")
 TINY = ["--size", "40x30", "--frames", "8", "--images", "24", "--seeds", "0,1", "--workers", "1"]
 
 
@@ -176,21 +176,19 @@ def test_the_edge_floor_is_the_error_of_the_mean_over_a_pixel(tmp_path):
 
 def test_a_process_that_dies_is_a_failed_job(tmp_path):
     """The others are done by another process."""
-    workers = accuracy_jobs.Workers(1, setup_in(tmp_path))
     jobs = [Deadly(scene="random-1"), accuracy_jobs.Job(scene="random-2")]
-    found = [result for _, result in workers.results(jobs, {}, inf)]
-    workers.close()
-    assert "exit code 9" in found[0]["error"]
-    assert "error" not in found[1]
+    with workers.Workers([PLACE], accuracy_jobs.Work(setup_in(tmp_path))) as one:
+        found = dict(one.outcomes([(job, None) for job in jobs], tries=1))
+    assert found[jobs[0], None] == workers.Lost("its process ended with exit code 9")
+    assert "error" not in found[jobs[1], None]
 
 
 def test_a_job_that_never_ends_is_left_after_the_limit(tmp_path, monkeypatch):
     """Its process is killed when the time is over."""
-    monkeypatch.setattr(accuracy_jobs, "GRACE", 0.1)
-    workers = accuracy_jobs.Workers(1, setup_in(tmp_path))
-    limit = time.monotonic() + 0.1
-    assert list(workers.results([Endless(scene="random-1")], {}, limit)) == []
-    workers.close()
+    monkeypatch.setattr(workers, "GRACE_S", 0.1)
+    with workers.Workers([PLACE], accuracy_jobs.Work(setup_in(tmp_path))) as one:
+        limit = time.monotonic() + 0.1
+        assert list(one.outcomes([(Endless(scene="random-1"), None)], deadline=limit)) == []
 
 
 def test_rows_and_numbers_of_the_command_line(capsys):
@@ -237,20 +235,3 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     assert "a/two/2: no memory" in accuracy_table.failures(results)
     row = accuracy_table.details(["a"], scenes, results).splitlines()[2]
     assert row == "| one | text | 1 / 1 / 1 | 0.1 / - / 0.05 | 0.25 / 0.2 / 1 **worse** |"
-
-
-def test_the_table_of_look_alikes_has_means_over_seeds_and_ratios():
-    """Errors of two presets on all seven scenes; one that was not fitted has a dash."""
-    names = list(look_alikes_fits.PUBLISHED)
-    fits = [
-        result(row, f"shared/{name}", seed, (0.1 * (seed + 1),) * 3)
-        for row in ("fast", "best")
-        for name in names
-        for seed in (0, 1)
-        if (row, name) != ("fast", names[0])
-    ]
-    lines = look_alikes_fits.table(["fast", "best"], fits).splitlines()
-    assert [line.split(" | ")[0] for line in lines[2:9]] == [f"| {name}" for name in names]
-    assert lines[2].startswith("| sliding_cube | 1 | - | - | 0.15 | 0.15 | 0.096 | 0.037 | 0.005 |")
-    assert lines[9].startswith("| over the closed form | 1 | 0.15 | 0.15 | 0.15 | 0.15 | 1 | 0.37")
-    assert lines[10].startswith("| seconds |  | 1.0 s |")

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..data.files import atomic_write, write_json
 from ..data.lock import locked
 from ..errors import UsageError
-from . import cluster, table
+from . import table
+from .cluster import Cluster
 from .job import Result, Task, do
 from .plan import Job, Plan, read_plan
 from .workers import Lost, Workers, places
@@ -61,12 +62,12 @@ def sweep(
         plan = read_plan(plan)
     out = Path(out).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    with locked(out, ".sweep.lock", "sweep"):
+    with locked(out, ".sweep.lock", "sweep"), _doers(plan, devices, workers, scheduler) as doers:
         results = _stored(out / STORE)
         done, total = 0, len(plan.recordings) + len(plan.fits)
         for jobs in (plan.recordings, plan.fits):
             tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
-            for task, outcome in _outcomes(tasks, devices, workers, scheduler):
+            for task, outcome in doers.outcomes(tasks):
                 result = _result(task, outcome)
                 if "metrics" in result or "error" in result or task.job.row is None:
                     _store(out / STORE, result)
@@ -82,18 +83,15 @@ def sweep(
     return wanted
 
 
-def _outcomes(
-    tasks: Sequence[Task], devices: Sequence[str], workers: int | None, scheduler: str | None
-) -> Iterator[tuple[Task, Any]]:
-    """Tasks and what became of them, here or on a cluster."""
-    if not tasks:
-        return
+def _doers(
+    plan: Plan, devices: Sequence[str], workers: int | None, scheduler: str | None
+) -> Workers | Cluster:
+    """Who does the jobs: processes of this machine, no more than there are fits, or a cluster."""
     if scheduler is not None:
-        yield from cluster.outcomes(scheduler, tasks, devices[0].partition(":")[0])
-        return
-    here = places(list(devices), min(workers, len(tasks)) if workers else None)[: len(tasks)]
-    with Workers(here, do) as processes:
-        yield from processes.outcomes(tasks)
+        return Cluster(scheduler, devices[0].partition(":")[0], do)
+    here = places(list(devices), workers)
+    count = min(len(here), len(plan.fits))
+    return Workers(places(list(devices), count), do)
 
 
 def _result(task: Task, outcome: Any) -> Result:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import time
 import traceback
@@ -24,8 +23,8 @@ from ..evaluate.panels import Findings, telling_row
 from ..recon.observations import data_hash
 from ..recon.settings import plain
 from ..recon.train import chosen_settings, reconstruct
-from ..render import runtime
 from ..sim.simulate import simulate
+from ..terminal import start_warp
 from .plan import Job, Plan
 from .workers import Place
 
@@ -67,7 +66,7 @@ def do(task: Task, place: Place) -> Result:
 
     A mistake of the user, or a failure of the fit, is a result, too: ``error`` says what is wrong.
     """
-    _quiet(place)
+    _begin(place)
     begun = time.monotonic()
     known = {"id": task.job.id, "scene": task.job.scene.name, "seed": task.job.seed}
     if task.job.row is not None:
@@ -84,10 +83,9 @@ def do(task: Task, place: Place) -> Result:
     return {**known, **result, "wall_s": time.monotonic() - begun}
 
 
-def _quiet(place: Place) -> None:
-    """As few threads as the place has CPUs; only errors are logged, runs have logs of their own."""
-    runtime.start()
-    logging.getLogger("gftorf_warp").setLevel(logging.ERROR)
+def _begin(place: Place) -> None:
+    """As many threads as the place has CPUs; Warp says nothing."""
+    start_warp()
     if place.cpus:
         torch.set_num_threads(len(place.cpus))
         cv2.setNumThreads(len(place.cpus))

@@ -22,6 +22,7 @@ KINDS: dict[str, tuple[type, str]] = {
     "scenes": (list, "a list of names of scenes and of folders"),
     "presets": (list, "a list of names of presets"),
     "seeds": (list, "a list of whole numbers"),
+    "one_seed": (list, "a list of presets"),
     "images": (int, "a whole number"),
     "frames": (str, '"all" or "ftorf13"'),
     "simulate": (dict, "a table of options of `gftorf simulate`"),
@@ -91,8 +92,11 @@ class Plan:
     """Raw frames that are scored, as ``gftorf compare --frames`` takes them."""
     simulate: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the recording of all scenes that are simulated."""
-    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Errors [m^2 x 100] of others on other data, by name and scene, shown beside the table."""
+    one_seed: frozenset[str] = frozenset()
+    """Presets that are fitted with the first seed only."""
+    published: Mapping[str, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
+    """Errors [m^2 x 100] of d, or of d and d_ToF, of others on other data, by name and scene, shown
+    beside ours."""
 
     @property
     def recordings(self) -> list[Job]:
@@ -107,7 +111,7 @@ class Plan:
             for seed in self.seeds
             for scene in self.scenes
             for row in self.rows
-            if seed == self.seeds[0] or fits(row.preset)
+            if seed == self.seeds[0] or (fits(row.preset) and row.preset not in self.one_seed)
         ]
 
 
@@ -143,6 +147,7 @@ def read_plan(path: str | Path) -> Plan:
         rows=tuple(_rows(content, path)),
         seeds=tuple(dict.fromkeys(seeds)),
         images=images,
+        one_seed=frozenset(_presets(content.get("one_seed", []), "one_seed", path)),
         frames=content.get("frames", "all"),
         simulate=_recording(content.get("simulate", {}), path),
         published=_published(content.get("published", {}), path),
@@ -187,10 +192,14 @@ def _scene(word: str, path: Path) -> Scene:
     return Scene(name=name if NAME.fullmatch(name) else "sequence", sequence=folder.resolve())
 
 
+def _presets(names: list, key: str, path: Path) -> list[str]:
+    _check_keys(_texts(names, key, path), presets.PRESETS, path, f"{key}: ")
+    return names
+
+
 def _rows(content: Mapping[str, Any], path: Path) -> Iterable[Row]:
     """Every preset as it is, and those that fit something with every list of changes."""
-    names = _texts(content["presets"], "presets", path)
-    _check_keys(names, presets.PRESETS, path, "presets: ")
+    names = _presets(content["presets"], "presets", path)
     changes = content.get("changes", {})
     for label, words in changes.items():
         if not NAME.fullmatch(label) or label == PLAIN:
@@ -212,12 +221,16 @@ def _recording(options: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
 
 
-def _published(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, float]]:
+def _published(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, tuple[float, ...]]]:
+    found: dict[str, dict[str, tuple[float, ...]]] = {}
     for name, errors in tables.items():
-        numbers = isinstance(errors, dict) and all(
-            isinstance(value, int | float) and not isinstance(value, bool)
-            for value in errors.values()
-        )
-        if not numbers:
-            raise _wrong(path, f"published.{name}", "expected a table: scene = error")
-    return dict(tables)
+        where, found[name] = f"published.{name}", {}
+        if not isinstance(errors, dict):
+            raise _wrong(path, where, "expected a table: scene = error of d, or [d, d_ToF]")
+        for scene, given in errors.items():
+            numbers = given if isinstance(given, list) else [given]
+            if not 1 <= len(numbers) <= 2 or not all(type(x) in (int, float) for x in numbers):
+                why = f"expected an error of d, or [d, d_ToF], found {given!r}"
+                raise _wrong(path, f"{where}.{scene}", why)
+            found[name][scene] = tuple(map(float, numbers))
+    return found

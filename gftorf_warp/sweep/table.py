@@ -54,7 +54,7 @@ def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
             lines.append(_line(scene, name, found))
         for name, errors in plan.published.items():
             if scene.name in errors:
-                cells = {"all": f"{errors[scene.name]:.3g}"}
+                cells = dict(zip(("all", "d_ToF"), map(_three, errors[scene.name]), strict=False))
                 title = f"{name} (other data)"
                 lines.append(Line(scene=scene.name, row=title, cells=cells, kind="published"))
     return lines
@@ -80,6 +80,11 @@ def failures(results: Iterable[Result]) -> list[str]:
     return [f"{result['id']}: {result['error']}" for result in results if "error" in result]
 
 
+def exit_code(results: Iterable[Result]) -> int:
+    """0 if every job is done, else the largest exit code of those that failed."""
+    return max((result["exit_code"] for result in results if "error" in result), default=0)
+
+
 def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
     """The table as Markdown, with what failed."""
     titles = ["scene", "row", *COLUMNS, *COSTS]
@@ -92,21 +97,28 @@ def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
 
 
 def html(plan: Plan, results: Mapping[str, Result], out: Path) -> str:
-    """The table as an offline page, with pictures of the first seed of every row."""
-    head = ["scene", "row", *COLUMNS, *COSTS]
-    lines = [*lines_of(plan, results), *over_scenes(plan, results)]
-    rows = [
-        (line.kind, [page.escape(line.scene), page.escape(line.row),
-                     *(page.escape(line.cells.get(title, NONE)) for title in head[2:])])
-        for line in lines
-    ]  # fmt: skip
-    body = page.section("Errors and costs", page.caption(page.escape(_about(plan))))
-    body += page.table(head, rows)
+    """The tables as an offline page, with pictures of the first seed of every row."""
+    body = "<header><h1>Sweep</h1></header>"
+    about = page.caption(page.escape(_about(plan)))
+    body += page.section("Over the closed form", about, _html(over_scenes(plan, results), ERRORS))
     if failed := failures(results.values()):
         items = "".join(f"<li>{page.escape(failure)}</li>" for failure in failed)
         body += page.section("What failed", f"<ul>{items}</ul>")
-    body += "".join(_pictures(plan, scene, out) for scene in plan.scenes)
+    lines = lines_of(plan, results)
+    for scene in plan.scenes:
+        own = [line for line in lines if line.scene == scene.name]
+        shown = _html(own, [*COLUMNS, *COSTS]), _pictures(plan, scene, out)
+        body += page.section(page.escape(scene.name), *shown)
     return page.document("Sweep", body)
+
+
+def _html(lines: Iterable[Line], titles: Iterable[str]) -> str:
+    """Lines of one scene as a table."""
+    titles = list(titles)
+    rows = [(ln.kind, [ln.row, *(ln.cells.get(title, NONE) for title in titles)]) for ln in lines]
+    return page.table(
+        ["", *titles], [(kind, [page.escape(cell) for cell in cells]) for kind, cells in rows]
+    )
 
 
 def _about(plan: Plan) -> str:
@@ -166,6 +178,10 @@ def _ratio(found: Sequence[Result], title: str) -> float | None:
     return sum(a for a, _ in known) / sum(b for _, b in known) if known else None
 
 
+def _three(value: float) -> str:
+    return f"{value:.3g}"
+
+
 def _of(known: int, scenes: int) -> str:
     return "" if known == scenes else f" (of {known})"
 
@@ -194,5 +210,5 @@ def _pictures(plan: Plan, scene: Scene, out: Path) -> str:
         errors |= {name: each["error"] for name, each in images.items() if "error" in each}
         scale = pictures.error_scale([first["closed_form_error"]])
         figures = [page.picture(image, scale, title, "|error|") for title, image in errors.items()]
-        html += page.row(figures)
-    return page.section(page.escape(scene.name), html)
+        html += page.row(figures, len(shown))
+    return html

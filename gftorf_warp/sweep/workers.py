@@ -6,6 +6,7 @@ does it again, and whatever stores checkpoints goes on from them.
 
 from __future__ import annotations
 
+import logging
 import math
 import multiprocessing
 import os
@@ -158,6 +159,9 @@ def _serve(connection: Connection, place: Place, work: Callable[[Any, Place], An
 
     if place.cpus:
         os.sched_setaffinity(0, place.cpus)
+    log = logging.getLogger("gftorf_warp")  # runs have logs of their own
+    log.addHandler(logging.NullHandler())
+    log.propagate = False
     try:
         with sigterm_raises():
             while True:

@@ -1,0 +1,232 @@
+"""Sweeps of tiny scenes: plans, resumption, lost processes, failures, tables, a Dask cluster."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moving_box import recording
+
+from gftorf_warp.cli import main
+from gftorf_warp.data.write import write
+from gftorf_warp.errors import InputError, ResourceError
+from gftorf_warp.sweep import table
+from gftorf_warp.sweep.command import sweep
+from gftorf_warp.sweep.plan import Plan, Row, Scene, read_plan
+from gftorf_warp.sweep.workers import Lost, Place, Workers, places
+
+TINY = """
+scenes = ["demo", "box"]
+presets = ["ctof", "demo"]
+seeds = [0, 1]
+images = 8
+[simulate]
+size = [16, 12]
+frames = 8
+[published]
+others = { demo = [1.5, 0.5], box = 2 }
+"""
+JOBS = [
+    "demo/simulated",
+    *(f"{scene}/{row}-0" for scene in ("demo", "box") for row in ("ctof", "demo")),
+    *(f"{scene}/demo-1" for scene in ("demo", "box")),
+]
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A folder with a plan, a sequence and the finished sweep; its results."""
+    folder = tmp_path_factory.mktemp("sweep")
+    write("ftorf", folder / "box", *recording(frames=8))
+    (folder / "plan.toml").write_text(TINY)
+    return folder, sweep(folder / "plan.toml", folder / "out", workers=1)
+
+
+def test_every_job_has_a_result_and_a_run(swept):
+    """Scenes x rows x seeds; a preset that fits nothing has no changes and one seed."""
+    folder, results = swept
+    assert list(results) == JOBS
+    assert not [result["id"] for result in results.values() if "error" in result]
+    for id in JOBS[1:]:
+        assert (folder / "out" / "runs" / id / "config.json").is_file()
+        assert results[id]["metrics"]["d_mse_x100"] > 0
+    assert json.loads((folder / "out" / "sweep.json").read_text()) == list(results.values())
+    kinds = {id: results[id]["metrics"]["seed"] for id in JOBS[1:]}
+    assert kinds["box/demo-1"] == 1
+    assert kinds["box/demo-0"] == 0
+
+
+def test_what_is_done_is_not_done_again(swept):
+    """The same call adds nothing; a lost result is made again from its finished run."""
+    folder, results = swept
+    store = folder / "out" / "results.jsonl"
+    lines = [line for line in store.read_text().splitlines() if "metrics" in line]
+    assert sweep(folder / "plan.toml", folder / "out", workers=1).keys() == results.keys()
+    assert [line for line in store.read_text().splitlines() if "metrics" in line] == lines
+    cut = "\n".join(lines)[: -len(lines[-1]) // 2]  # a crash cut the last line off
+    store.write_text(cut)
+    again = sweep(folder / "plan.toml", folder / "out", workers=1)
+    last = json.loads(lines[-1])["id"]
+    assert again[last]["metrics"] == results[last]["metrics"]
+    assert all(json.loads(line) for line in store.read_text().splitlines())
+
+
+def test_the_table_has_means_spreads_and_what_others_published(swept):
+    """Every number of the Markdown table from the results; the page shows all rows."""
+    folder, results = swept
+    rows = {}
+    for line in (folder / "out" / "sweep.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        rows[tuple(cells[:2])] = cells[2:]
+    errors = [results[f"box/demo-{seed}"]["metrics"]["d_mse_x100"] for seed in (0, 1)]
+    low, high = sorted(errors)
+    mean = f"{np.mean(errors):.3g}"
+    given = rows["box", "demo"][0]
+    assert given.startswith(mean)
+    assert given in (mean, f"{mean} ({low:.3g} to {high:.3g})")
+    assert rows["demo", "others (other data)"][:4] == ["1.5", "-", "-", "0.5"]
+    closed = [
+        results[f"{name}/ctof-0"]["metrics"]["closed_form_mse_x100"] for name in ("demo", "box")
+    ]
+    means = [
+        np.mean([results[f"{name}/demo-{seed}"]["metrics"]["d_mse_x100"] for seed in (0, 1)])
+        for name in ("demo", "box")
+    ]
+    ratio = np.exp(np.mean(np.log(np.divide(means, closed))))
+    assert float(rows["over the closed form", "demo"][0]) == pytest.approx(ratio, rel=6e-3)
+    page = (folder / "out" / "sweep.html").read_text()
+    assert page.count("<img class") == 2 * (2 + 2 + 1 + 2)  # truth, closed form, rows; errors
+    assert "others (other data)" in page
+
+
+def test_the_command_prints_the_table_and_lists_jobs(swept, capsys):
+    """The exit code is 0, and --dry-run does nothing."""
+    folder, _ = swept
+    assert main(["sweep", str(folder / "plan.toml"), "--dry-run"]) == 0
+    assert capsys.readouterr().out.split() == JOBS
+    assert main(["sweep", str(folder / "plan.toml"), "--out", str(folder / "out"), "-q"]) == 0
+    assert "| box | demo |" in capsys.readouterr().out
+
+
+def test_a_job_that_fails_is_a_row_with_its_error(tmp_path):
+    """The others are done, the exit code is that of the error."""
+    write("ftorf", tmp_path / "box", *recording(frames=8))
+    plan = Plan(
+        scenes=(Scene(name="box", sequence=tmp_path / "box"),),
+        rows=(Row(preset="ctof"), Row(preset="demo", changes=("render.zoom=2",), label="zoom")),
+    )
+    results = sweep(plan, tmp_path / "out", workers=1)
+    assert "error" not in results["box/ctof-0"]
+    assert "zoom" in results["box/demo+zoom-0"]["error"]
+    assert table.exit_code(results.values()) == 2
+    assert "failed: box/demo+zoom-0" in (tmp_path / "out" / "sweep.md").read_text()
+    assert "What failed" in (tmp_path / "out" / "sweep.html").read_text()
+
+
+WRONG = {
+    "scenes = []": "not empty",
+    'scenes = ["demo"]': "presets",
+    'scenes = ["demi"]\npresets = ["best"]': "did you mean demo",
+    'scenes = ["demo"]\npresets = ["bets"]': "did you mean best",
+    'scenes = ["demo", "demo"]\npresets = ["best"]': "two are called demo",
+    'scenes = ["demo"]\npresets = ["best"]\nseeds = [-1]': "whole numbers",
+    'scenes = ["demo"]\npresets = ["best"]\nseeds = true': "list of whole numbers",
+    'scenes = ["demo"]\npresets = ["best"]\nimages = 0': "at least 1",
+    'scenes = ["demo"]\npresets = ["best"]\nimage = 4': "did you mean images",
+    'scenes = ["demo"]\npresets = ["best"]\n[simulate]\nsized = 3': "did you mean size",
+    'scenes = ["demo"]\npresets = ["best"]\n[changes]\na = "b=1"': "list of settings",
+    'scenes = ["demo"]\npresets = ["best"]\n[changes]\n"../x" = ["b=1"]': "letters",
+    'scenes = ["demo"]\npresets = ["best"]\n[published]\nx = 3': "expected a table",
+    'scenes = ["demo"]\npresets = ["best"]\n[published]\nx = {demo = "3"}': "error of d",
+    "scenes = [": "Invalid",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_plan_is_a_named_error(tmp_path, text):
+    """Before any work, with the key."""
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(InputError, match="(?s)plan.toml.*" + WRONG[text]):
+        read_plan(tmp_path / "plan.toml")
+
+
+def die_once(task, place):
+    """Kill the own process the first time."""
+    path, times = task
+    count = len(list(Path(path).iterdir()))
+    (Path(path) / str(count)).touch()
+    if count < times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return count, place.device
+
+
+def sleep(task, place):  # noqa: ARG001
+    """A job that takes so many seconds."""
+    time.sleep(task)
+
+
+@pytest.mark.parametrize(("deaths", "outcome"), [(1, (1, "cpu")), (9, None)])
+def test_a_lost_process_costs_a_try(tmp_path, deaths, outcome):
+    """The task is done by another one, at most three times."""
+    with Workers([Place("cpu")], die_once) as workers:
+        ((_, found),) = workers.outcomes([(str(tmp_path), deaths)])
+    if outcome is None:
+        assert found == Lost("its process ended with exit code -9")
+        assert len(list(tmp_path.iterdir())) == 3
+    else:
+        assert found == outcome
+
+
+def test_processes_end_with_their_owner():
+    """A job that goes on when the loop is left is told to end."""
+    begun = time.monotonic()
+    with Workers([Place("cpu"), Place("cpu")], sleep) as workers:
+        assert next(workers.outcomes([0.0, 600.0])) == (0.0, None)
+    assert time.monotonic() - begun < 60.0
+
+
+def test_places_share_gpus_and_cpus():
+    """One process per GPU; more of them take turns; all CPUs are used once."""
+    found = places(["cuda:0", "cuda:1"])
+    assert [place.device for place in found] == ["cuda:0", "cuda:1"]
+    found = places(["cuda:0"], 2)
+    assert [place.device for place in found] == ["cuda:0"] * 2
+    used = [cpu for place in found for cpu in place.cpus]
+    assert len(used) == len({*used})
+    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1:
+        assert {*used} == os.sched_getaffinity(0)
+
+
+def test_rows_are_presets_with_and_without_changes(tmp_path):
+    """Changes are for presets that fit something; one_seed keeps expensive ones to the first."""
+    text = 'scenes = ["demo"]\npresets = ["ctof", "best", "fast"]\nseeds = [3, 4]\n'
+    text += 'one_seed = ["fast"]\n[changes]\nwide = ["render.low_pass=0.3"]\n'
+    (tmp_path / "plan.toml").write_text(text)
+    plan = read_plan(tmp_path / "plan.toml")
+    first = ["ctof-3", "best-3", "best+wide-3", "fast-3", "fast+wide-3"]
+    wanted = [*first, "best-4", "best+wide-4"]
+    assert [job.id for job in plan.fits] == [f"demo/{name}" for name in wanted]
+    assert plan.rows[2].changes == ("render.low_pass=0.3",)
+
+
+def test_a_cluster_does_the_same_jobs(tmp_path):
+    """On two Dask workers; without a scheduler a named error."""
+    distributed = pytest.importorskip("distributed", reason="extra cluster is not installed")
+    (tmp_path / "plan.toml").write_text(
+        'scenes = ["demo"]\npresets = ["ctof", "temporal"]\n'
+        "[simulate]\nsize = [16, 12]\nframes = 8\n"
+    )
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        address = cluster.scheduler_address
+        there = sweep(tmp_path / "plan.toml", tmp_path / "there", scheduler=address)
+    here = sweep(tmp_path / "plan.toml", tmp_path / "here", workers=1)
+    assert not [result for result in there.values() if "error" in result]
+    for id in ("demo/ctof-0", "demo/temporal-0"):
+        assert there[id]["metrics"]["d_mse_x100"] == here[id]["metrics"]["d_mse_x100"]
+    with pytest.raises(ResourceError, match="no Dask scheduler answers"):
+        sweep(tmp_path / "plan.toml", tmp_path / "nowhere", scheduler="tcp://127.0.0.1:9")
