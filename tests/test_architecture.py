@@ -52,6 +52,10 @@ TABLE = {
         {"data", "evaluate", "export", "recon", "render", "scene"},
         TORCH | {"viser"},
     ),
+    "sweep": (
+        {"data", "evaluate", "process", "recon", "render", "sim", "terminal"},
+        TORCH | {"cv2", "distributed"},
+    ),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}

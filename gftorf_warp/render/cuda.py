@@ -193,6 +193,12 @@ def free_memory(device: torch.device | str) -> float | None:
     return None if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
 
 
+def peak_memory(device: torch.device | str) -> float | None:
+    """Largest memory of a GPU that torch has held in this process [B]; None for a CPU."""
+    device = torch.device(device)
+    return None if device.type == "cpu" else float(torch.cuda.max_memory_allocated(device))
+
+
 @functools.cache
 def side_stream(device: torch.device) -> SideStreams:
     """One side stream, always the same one: cuBLAS keeps a workspace for every stream."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -23,6 +22,7 @@ from ..evaluate.panels import Findings, telling_row
 from ..recon.observations import data_hash
 from ..recon.settings import plain
 from ..recon.train import chosen_settings, reconstruct
+from ..render.cuda import peak_memory
 from ..sim.simulate import simulate
 from ..terminal import start_warp
 from .plan import Job, Plan
@@ -85,6 +85,8 @@ def do(task: Task, place: Place) -> Result:
 
 def _begin(place: Place) -> None:
     """As many threads as the place has CPUs; Warp says nothing."""
+    import cv2
+
     start_warp()
     if place.cpus:
         torch.set_num_threads(len(place.cpus))
@@ -118,8 +120,9 @@ def _fitted(task: Task, place: Place) -> Result:
     run = _patiently(lambda: reconstruct(sequence, folder, preset, **chosen))
     metrics, found = score(run, frames=plan.frames)
     _keep_picture(picture_of(job, task.out), found)
+    memory = peak_memory(place.device)
     about = {"seconds": run.config.get("seconds_reconstruct"), "gaussians": run.gaussians}
-    return {"key": key, "metrics": metrics, **about, "memory_mib": _memory(kind)}
+    return {"key": key, "metrics": metrics, **about, "memory_mib": memory and memory / 2**20}
 
 
 def _patiently(reconstruct: Any) -> Any:
@@ -156,11 +159,6 @@ def _keep_picture(path: Path, found: Findings) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **{k: image.astype(np.float16) for k, image in images.items()})
-
-
-def _memory(kind: str) -> float | None:
-    """Largest memory of the GPU that this process has held [MiB]."""
-    return torch.cuda.max_memory_allocated() / 2**20 if kind == "cuda" else None
 
 
 def _hash(*values: object) -> str:
