@@ -47,12 +47,14 @@ def test_large_numbers_are_not_taken_for_infinite_ones():
 
 
 @pytest.mark.parametrize("splat_distance", list(SplatDistance))
+@pytest.mark.parametrize("capacity", [ROOM_FOR_PAIRS, None])
 @pytest.mark.parametrize("name", NOWHERE)
-def test_a_gaussian_without_a_place_makes_every_pixel_nan(name, splat_distance, device):
-    """Where nothing may wait for the device, an image is NaN instead of finite and wrong."""
-    settings = replace(CASE.settings, pair_capacity=ROOM_FOR_PAIRS, splat_distance=splat_distance)
+def test_a_gaussian_without_a_place_makes_every_pixel_nan(name, capacity, splat_distance, device):
+    """In one of many renderings an image is NaN instead of finite and wrong."""
+    settings = replace(CASE.settings, pair_capacity=capacity, splat_distance=splat_distance)
+    workspace = None if capacity else buffers.Workspace()
     field = spoiled(name, float("nan"), device)
-    rendering = api.rasterize(field, CASE.camera, CASE.sensor, settings)
+    rendering = api.rasterize(field, CASE.camera, CASE.sensor, settings, workspace=workspace)
     for image in ("quads", "phasor", "colour", "distance", "distortion"):
         assert getattr(rendering, image).isnan().all(), image
 

@@ -103,10 +103,10 @@ def rasterize(
 ) -> Rendering:
     """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
 
-    A field with a parameter that is NaN or infinite is refused. With ``control`` or a pair
-    capacity, where nothing may wait for the device, it is drawn instead: NaN where a Gaussian has a
-    reflectivity or colour that is NaN, and everywhere if its place, size, orientation or opacity is
-    not finite.
+    A field with a parameter that is NaN or infinite is refused. In one of many renderings, with
+    ``workspace``, ``control`` or a pair capacity, where nothing may wait for the device, it is
+    drawn instead: NaN where a Gaussian has a reflectivity or colour that is NaN, and everywhere if
+    its place, size, orientation or opacity is not finite.
 
     Runs on the device of the field. Differentiable in every tensor of the field except its layer,
     in ``background``, ``extra`` and the 0-d tensors of the sensor.
@@ -156,7 +156,7 @@ def rasterize(
         if tensor is not None and (tensor.dtype != torch.float32 or tensor.device != field.device):
             want = f"float32 on {field.device}, where the field is"
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}, must be {want}")
-    if control is None and settings.pair_capacity is None:
+    if control is None and workspace is None and settings.pair_capacity is None:
         field.check_finite()
     screen = torch.zeros(count, 4, device=field.device) if screen_gradient else None
     ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
