@@ -1,6 +1,7 @@
 """The picture of a check: hypotheses on the order of the shifts, and that its advice mends them."""
 
 import dataclasses
+import json
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from ftorf_folder import scene
 from gftorf_warp.cli import main
 from gftorf_warp.data.check import check
 from gftorf_warp.data.write import write
+from gftorf_warp.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
 
@@ -68,3 +70,39 @@ def test_advice_names_the_place_in_each_format(tmp_path, form):
         folder, words = write("capture", tmp_path / "seq", mirrored()), "frames.shift_rad"
     said = [finding.text for finding in check(folder).findings if finding.name == "order"]
     assert words in said[0]
+
+
+def test_the_shifts_that_are_suggested_mend_a_capture(tmp_path):
+    """Stored as it is said, with the manifest removed as it is said, nothing is left to say."""
+    folder = write("capture", tmp_path / "seq", mirrored())
+    before = check(folder)
+    listed = before.warnings[0].partition("1. frames.shift_rad in capture.json, ")[2]
+    degrees = [float(d) for d in listed.partition(" degrees in turn")[0].split(",")]
+    content = json.loads((folder / "capture.json").read_text())
+    for frame in content["frames"]:
+        frame["shift_rad"] = np.radians(degrees[frame["id"] % len(degrees)])
+    (folder / "capture.json").write_text(json.dumps(content))
+    (said,) = (line for line in before.lines if line.startswith("manifest"))
+    with pytest.raises(InputError, match="MANIFEST.sha256"):
+        check(folder)
+    assert "MANIFEST.sha256" in said
+    assert "remove it" in said
+    (folder / "MANIFEST.sha256").unlink()
+    assert check(folder).findings == []
+
+
+@pytest.mark.parametrize(
+    ("form", "place"),
+    [
+        ("capture", "frames.camera_to_world in capture.json"),
+        ("ftorf", "cams/tof_extrinsics.npy and cams/poses.json"),
+        ("torf", "cams/tof_extrinsics.npy"),
+    ],
+)
+def test_poses_are_asked_for_where_the_format_has_them(tmp_path, form, place):
+    """Poses of F-ToeRF also need the file that makes them count."""
+    still = mirrored()
+    changing = still.quads * np.repeat([1.0, -2.0], 4).astype(np.float32)[:, None, None]
+    folder = write(form, tmp_path / "seq", dataclasses.replace(still, quads=changing))
+    (said,) = (finding.text for finding in check(folder).findings if finding.name == "poses")
+    assert said.endswith(f"store its poses in {place}")

@@ -11,6 +11,7 @@ import numpy as np
 from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError
 from . import findings, phase, reprojection, specs, timing, units
+from .capture_json import MANIFEST
 from .check_sheet import check_sheet
 from .constant import spread
 from .cycles import frequencies_by_order
@@ -63,6 +64,9 @@ def check(path: str | Path, sheet: str | Path | None = None) -> Report:
     _facts(sequence, report)
     _assumptions(sequence, report)
     examine(sequence, report)
+    if report.findings and (Path(path) / MANIFEST).is_file():
+        why = "has the SHA-256 of every file: after a change of your own remove it"
+        report.add("manifest", f"{MANIFEST} {why}, or the folder is refused")
     if sheet is not None:
         with as_errors(Path(sheet)):
             atomic_write(sheet, check_sheet(_thinned(sequence), report))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from . import specs
 from .decode import quartet_phasors
 from .sequence import Sequence
 
@@ -22,11 +23,6 @@ BINS = 12  # of amplitude, with equal numbers of pixels
 QUARTETS_MAX = 8  # quartets, spread over the sequence: a hundred thousand pixels in small images
 # [1] ratio of what two hypotheses leave: the data tells them apart by a factor of two or more
 DECIDED = 0.5
-OPTIONS = {
-    "capture": ("sensor.adc_zero in capture.json", "sensor.dc_offset in capture.json"),
-    "ftorf": ("cams/adc_zero.npy", "cams/dc_offset.npy"),
-}
-"""Where a format states either."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +61,7 @@ class ConstantPart:
 
     def advice(self, sequence: Sequence, form: str) -> str:
         """Which value of the calibration to change, and to what."""
-        zero_at, dc_at = OPTIONS[form]
+        zero_at, dc_at = (specs.place(form, name) for name in ("adc_zero", "dc_offset"))
         zero = f"{zero_at} = {sequence.calibration.adc_zero + self.zero:.5g} and dc_offset 0"
         dc = f"{dc_at} = {self.dc_offset:.4g}"
         if self.is_zero is None:

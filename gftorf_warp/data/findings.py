@@ -125,7 +125,7 @@ def camera(sequence: Sequence, report: Report) -> None:
             report.warn(
                 "poses",
                 f"poses: all are identity, but {share:.0%} of the pixels change: if the "
-                "camera moved, store its poses in cams/tof_extrinsics.npy",
+                f"camera moved, store its poses in {_places_of_poses(report.form)}",
             )
     if sequence.colour.camera_from_world is not None:
         relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour.camera_from_world)
@@ -134,6 +134,14 @@ def camera(sequence: Sequence, report: Report) -> None:
         if baseline > BASELINE_MAX_M:
             away = f"the colour camera is {baseline:.4g} m away"
             report.warn("baseline", f"{away}: millimetres, or another coordinate system?")
+
+
+def _places_of_poses(form: str) -> str:
+    """Where poses are stored so that the format's reader takes them."""
+    if form == "capture":
+        return specs.place(form, "pose")
+    names = ("tof_extrinsics", "poses") if form == "ftorf" else ("tof_extrinsics",)
+    return " and ".join(specs.place(form, name) for name in names)
 
 
 def phasors(sequence: Sequence, report: Report) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..constants import FRAMES_PER_QUARTET
+from . import specs
 from .constant import spread
 from .cycles import solution
 from .decode import distance_from_phase
@@ -82,8 +83,9 @@ class Hypothesis:
         if form == "ftorf":
             turns = np.round(2.0 * self.shifts / math.pi).astype(int) % FRAMES_PER_QUARTET
             channel = np.array([0, 2, 1, 3])[turns]  # of a shift of 0, 90, 180, 270 degrees
-            return f"tof_permutation.npy = {np.argsort(channel).tolist()}, {degrees}"
-        return f"frames.shift_rad in capture.json, {degrees}"
+            stated = specs.place(form, "permutation")
+            return f"{stated} = {np.argsort(channel).tolist()}, {degrees}"
+        return f"{specs.place(form, 'shift')}, {degrees}"
 
     def beats(self, stated: Hypothesis) -> bool:
         """Whether the evidence for it, instead of what is stated, is more than noise."""

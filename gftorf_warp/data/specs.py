@@ -67,6 +67,12 @@ def fields(name: str) -> dict[str, Field]:
     }
 
 
+def place(name: str, field: str) -> str:
+    """Where a format states a value, for messages: ``KEY in capture.json``, or the best file."""
+    found = fields(name)[field]
+    return f"{found.key} in {found.paths[0]}" if found.kind == "json" else found.paths[0]
+
+
 def layer_field(name: str) -> Field:
     """The field that describes a layer of the truth; ``{h}`` in its key is a harmonic.
 
