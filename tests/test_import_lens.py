@@ -137,13 +137,14 @@ BAD = [  # file, what it contains, further keys, a word of the error
 
 
 @pytest.mark.parametrize(("name", "content", "more", "word"), BAD)
-def test_a_file_that_is_no_lens_is_named(name, content, more, word, tmp_path):
+def test_a_file_that_is_no_lens_is_named(name, content, more, word, tmp_path, capfd):
     """Damage, other models, other sizes, contradictions."""
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError) as error:
         lens_of(path, more)
     assert word in str(error.value)
+    assert capfd.readouterr().err == "", "OpenCV's own messages"
 
 
 def test_a_flipped_bit_of_a_lens_never_crashes(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,18 @@ PNG = b"\x89PNG\r\n\x1a\n"
 WIDTH_TAG, HEIGHT_TAG = 256, 257
 BYTES_PER_PIXEL = 8  # at most: four channels of 16 bits
 TAG_FORMATS = {3: "H", 4: "I"}  # a size is a number of 16 or 32 bits
+
+
+@contextlib.contextmanager
+def without_log_of_opencv() -> Iterator[None]:
+    """Context in which OpenCV prints nothing about a damaged file: our error says it."""
+    import cv2
+
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -33,7 +47,8 @@ def read_picture(path: Path) -> np.ndarray:
     try:
         pixels = sum(width * height for width, height in sizes)
         check_unpacked(BYTES_PER_PIXEL * pixels, len(data))
-        done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        with without_log_of_opencv():
+            done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (ValueError, cv2.error) as error:
         raise unreadable(path, str(error).splitlines()[0][:200]) from error
     shapes = {(page.shape, page.dtype) for page in pages}

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..data.pictures import without_log_of_opencv
 from ..data.texts import read_json
 from ..data.untrusted import read_text, unreadable
 from .text_files import numbers, read_rows
@@ -131,7 +132,8 @@ def _opencv(path: Path, content: str) -> Lens:
     if not content.lstrip().startswith(("%YAML", "<?xml", "{")):
         content = f"%YAML:1.0\n---\n{content}"  # as ROS writes it
     try:
-        storage = cv2.FileStorage(content, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        with without_log_of_opencv():
+            storage = cv2.FileStorage(content, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         matrix = _matrix(storage, MATRICES)
         lens = _matrix(storage, LENSES)
         sides = [storage.getNode(name).real() for name in ("image_width", "image_height")]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..data.pictures import without_log_of_opencv
 from ..data.untrusted import SIDE_MAX, unreadable
 from .raw_files import raw_bytes, size_of
 
@@ -34,13 +35,11 @@ def read_radiance(path: Path, size: tuple[int, int] | None = None) -> Float[np.n
         raise unreadable(path, f"expected pixels {expected}, found {shape[1]}x{shape[0]}")
     if size_of(path) - found.end() < 4 * shape[0]:  # a row takes at least four bytes
         raise unreadable(path, "truncated")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        with without_log_of_opencv():
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise unreadable(path, str(error)[:200]) from error
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if image is None or image.shape != (*shape, 3) or image.dtype != np.float32:
         raise unreadable(path, f"expected {shape[1]}x{shape[0]} pixels, found damaged ones")
     if not np.isfinite(image).all():
