@@ -4,13 +4,16 @@ without a word.
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from moving_box import recording
 
 from gftorf_warp.cli import main
 from gftorf_warp.data.write import write
+from gftorf_warp.evaluate.caveats import caveats
 from gftorf_warp.recon import checkpoint
 
 IMAGES, LATE = 40, 36
@@ -178,3 +181,12 @@ def test_distances_beyond_the_range_are_announced(place, capsys):
     (caveat,) = json.loads((Path(out) / "metrics.json").read_text())["caveats"]
     assert "beyond the unambiguous range of 2.498 m" in caveat
     assert caveat in capsys.readouterr().err
+
+
+def test_unknown_distances_are_no_share_of_the_true_ones():
+    """All known distances lie beyond the range, also where half of the truth is unknown."""
+    sequence, truth = recording(frames=4, f_mod_hz=60e6)
+    distance = np.full_like(truth.distance, 3.6)
+    distance[:, ::2] = np.nan
+    (caveat,) = caveats({}, sequence, replace(truth, distance=distance))
+    assert caveat.startswith("100 %")

@@ -12,7 +12,10 @@ from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import pictures, video
 from gftorf_warp.evaluate.captioned import Panel, captioned
+from gftorf_warp.evaluate.previews import with_units
 from gftorf_warp.evaluate.views import render_to_folder, render_to_video
+from gftorf_warp.recon.fallback import SOURCES
+from gftorf_warp.recon.outlines import OUTLINE
 
 
 @pytest.fixture
@@ -69,6 +72,9 @@ def test_headers_state_time_units_frame_and_camera(run, tmp_path):
     assert header["time_s"].tolist() == [3.4 / 120]
     assert "raw_frame" not in header
     assert "quad_180: of the sequence" in header["units"]
+    sources = with_units({}, ["source"])["units"]
+    assert all(f"{k} {name}" in sources for k, name in enumerate(SOURCES))
+    assert f"{OUTLINE} outline" in sources
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from moving_box import as_phasors, recording, turned, with_colour
+from waits import Operations
 
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
@@ -18,12 +19,14 @@ from gftorf_warp.recon.observations import observe, reduced
 from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.run import Run, VolumeRun
 from gftorf_warp.recon.train import reconstruct
-from gftorf_warp.recon.volume.loop import VolumeLoop, begin
+from gftorf_warp.recon.volume.loop import VolumeLoop, begin, from_dict
 from gftorf_warp.recon.volume.models import VOLUMES, new_volume
 from gftorf_warp.recon.volume.network import Light
 from gftorf_warp.recon.volume.settings import NetworkSettings
 from gftorf_warp.recon.volume.targets import Draw, Targets
 from gftorf_warp.scene.motion import Products
+from gftorf_warp.view.controls import about
+from gftorf_warp.view.subject import Subject
 
 NAMES = ("torf", "ftorf")
 
@@ -129,6 +132,7 @@ def test_a_run_is_rendered_compared_and_reported(tmp_path):
     assert here.colour is None
     extra = opened.render(0.0, opened.camera.resized(8, 6), extra=torch.zeros(0, 2)).extra
     assert extra.shape == (2, 6, 8)
+    assert "a neural volume, image 12 of 12" in about(Subject.open(run.path), 0)
     got = compare(opened)
     assert (got["method"], got["gaussians"], got["input"]) == ("ftorf", 0, "quads")
     assert got["flow_source"] == "file"
@@ -390,3 +394,48 @@ def test_half_precision_is_near_single(name, tmp_path):
     assert moved.abs().max() > 1e-3
     assert half_loss == pytest.approx(loss, rel=5e-3)
     assert (torch.sign(moved) == torch.sign(half_moved)).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_step_uploads_anything(name):
+    """Numbers of the host are on the device before the second step that needs them."""
+    settings = toy(name)
+    state = begin(settings, targets := targets_of(settings), 0, torch.device("cpu"))
+    for step in (0, 35):
+        for quartet in targets.observations.sequence.complete_quartets:
+            targets.around(quartet)
+            targets.around(quartet, after_only=True)
+        state.volume.terms(targets, step, settings, state.draw)
+        with Operations() as operations:
+            state.volume.terms(targets, step, settings, state.draw)
+        assert operations.found["mul"] > 0
+        assert not operations.found.keys() & {"lift_fresh", "arange", "_to_copy"}
+
+
+def test_a_checkpoint_of_a_gpu_goes_on_elsewhere(tmp_path):
+    """A GPU's generator has 16 bytes of state; its numbers go on as others, the same every time."""
+    settings = toy("ftorf")
+    state = begin(settings, targets_of(settings), 0, torch.device("cpu"))
+    stored = state.to_dict()
+    stored["draw"]["device"] = torch.zeros(16, dtype=torch.uint8)
+    drawn = [
+        from_dict(tmp_path, settings, stored, torch.device("cpu")).draw.pixels(64, 1000)
+        for _ in range(2)
+    ]
+    assert torch.equal(*drawn)
+    assert not torch.equal(drawn[0], state.draw.pixels(64, 1000))
+
+
+def test_a_checkpoint_without_moments_is_named(tmp_path):
+    """A run that cannot go on is an error of the user's files, no traceback."""
+    run = reconstruct(small(), tmp_path / "run", toy("ftorf", images=2))
+    stored = checkpoint.last(run.path)
+    stored["adam"]["param_groups"] = []
+    checkpoint.save(run.path, stored)
+    with pytest.raises(InputError, match="parts of the checkpoint do not fit"):
+        reconstruct(small(), tmp_path / "run", toy("ftorf", images=4))
+
+
+def targets_of(settings):
+    """What a volume of the small recording is compared with."""
+    return Targets(observe(small(), settings, "cpu"))

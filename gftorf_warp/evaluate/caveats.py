@@ -6,6 +6,8 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance
@@ -48,10 +50,11 @@ def _beyond_range(sequence: Sequence, truth: Truth | None) -> str:
     if truth is None:
         return ""
     distance, most = known_distance(truth), unambiguous_range(sequence)
-    share = float((distance > most).mean())  # NaN is not
+    known = np.isfinite(distance)
+    share = float((distance[known] > most).mean()) if known.any() else 0.0
     if not share:
         return ""
     return (
-        f"{100 * share:.2g} % of the true distances lie beyond the unambiguous range of "
+        f"{100 * share:.3g} % of the true distances lie beyond the unambiguous range of "
         f"{most:.4g} m: distances that are decoded from quads are wrapped there."
     )

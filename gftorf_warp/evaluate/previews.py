@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from ..data.exr import Attribute, write_exr
 from ..data.files import write_one_of_many
 from ..data.images import indexed_png_bytes, png_bytes
+from ..recon.fallback import SOURCES
 from . import pictures
 from .captioned import Panel, captioned
 
@@ -31,7 +32,7 @@ TITLES = {
 UNITS = {  # of channels; those of quads and phasors have the unit of the sequence's files
     **dict.fromkeys((*DISTANCES, "Z"), "m"),
     "opacity": "1",
-    "source": "index: 0 the fit, 1 temporal mean, 2 closed form",
+    "source": f"index: {', '.join(f'{k} {name}' for k, name in enumerate(SOURCES))}",
     **dict.fromkeys("RGB", "linear, of the sequence's colour images"),
 }
 

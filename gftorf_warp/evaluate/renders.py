@@ -54,8 +54,8 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
 def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sensor) -> Channels:
     """Images by channel name, as in an EXR file.
 
-    distance: ``distance`` [m], not divided by ``opacity`` [1]; ``source``, if the run has one: 0
-    the fit, 1 temporal mean, 2 closed form. distance_median: the same name [m], of the fit, 0 where
+    distance: ``distance`` [m], not divided by ``opacity`` [1]; ``source``, if the run has one: an
+    index into ``recon.fallback.SOURCES``. distance_median: the same name [m], of the fit, 0 where
     more than half of the light passes. quads: ``quad_<shift in degrees>``
     [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
     linear [1].

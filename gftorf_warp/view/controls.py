@@ -92,8 +92,9 @@ def about(subject: Subject, n: int) -> str:
     lines = [f"raw frame {n} of {subject.frames}, {1e3 * sequence.times[n]:.1f} ms"]
     if run is not None:
         reached, planned = run.config.get("images_optimised"), run.config.get("images")
-        if run.gaussians:
-            lines.append(f"{run.gaussians:,} Gaussians, image {reached:,} of {planned:,}")
+        if run.gaussians or reached:
+            what = f"{run.gaussians:,} Gaussians" if run.gaussians else "a neural volume"
+            lines.append(f"{what}, image {reached:,} of {planned:,}")
         else:
             lines.append("closed form: nothing was optimised")
     return "  \n".join(lines)

@@ -12,6 +12,7 @@ import torch
 from ...data.sequence import Sequence
 from ...data.temporal import camera_rests
 from ...errors import InputError
+from .. import checkpoint
 from ..observations import Observations
 from ..record import Metrics
 from ..settings import Method, ReconSettings
@@ -91,7 +92,8 @@ def fit(
     if stored is None:
         state = begin(settings, targets, seed, device)
     else:
-        state = from_dict(out, settings, stored, device)
+        with checkpoint.rebuilding(out):
+            state = from_dict(out, settings, stored, device)
     metrics = Metrics(out / "metrics.jsonl")
     metrics.rewind(state.images)
     near, far = state.volume.box.bounds

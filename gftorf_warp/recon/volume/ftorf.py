@@ -39,7 +39,7 @@ class Neighbours(NamedTuple):
     backward: Tensor
     """From quartet i to the one before."""
     from_before: Tensor
-    """From quartet i - 1 to quartet i, at the same points; minus ``backward`` without i - 1."""
+    """From quartet i - 1 to quartet i, at the same points; ``forward`` without i - 1."""
     from_after: Tensor
     """From quartet i + 1 back to quartet i, at the same points; ``backward`` without i + 1."""
 

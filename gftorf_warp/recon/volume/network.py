@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from ...scene.encoding import encoded, encoded_size
+from ...scene.encoding import encoded, encoded_size, powers_of_two
 from .settings import NetworkSettings, TimeCode
 
 FLOW_DEVIATION = 1e-5  # of the initial weights of the flow: nothing moves
@@ -40,6 +40,9 @@ class Light(NamedTuple):
 
 class VolumeNetwork(torch.nn.Module):
     """Density, light, blend and flow of points at T times."""
+
+    position_powers: Float[Tensor, "f"]
+    direction_powers: Float[Tensor, "f"]
 
     def __init__(self, settings: NetworkSettings, code_size: int, generator: torch.Generator):
         """Create the network with random weights.
@@ -71,6 +74,10 @@ class VolumeNetwork(torch.nn.Module):
         self.light_head = torch.nn.Linear(half, 4)
         self.blend_head = torch.nn.Linear(width, 1)
         self.flow_head = torch.nn.Linear(width, 6)
+        # an upload in every step would make a GPU wait
+        octaves = settings.position_octaves, settings.direction_octaves
+        for name, count in zip(("position_powers", "direction_powers"), octaves, strict=True):
+            self.register_buffer(name, powers_of_two(count), persistent=False)
         self._reset(generator)
 
     @torch.no_grad()
@@ -100,7 +107,7 @@ class VolumeNetwork(torch.nn.Module):
         self, points: Float[Tensor, "T P 3"], codes: Float[Tensor, "T C"] | None
     ) -> Float[Tensor, "T P w"]:
         """Values of points, in the units of the network, each at the time of its row."""
-        known = encoded(points, self.settings.position_octaves, columns=self._columns)
+        known = encoded(points, self.position_powers, columns=self._columns)
         values = functional.relu(self._joined("0", known, codes))
         for name, layer in self.hidden.items():
             found = layer(values)
@@ -122,7 +129,7 @@ class VolumeNetwork(torch.nn.Module):
 
     def light(self, trunk: Float[Tensor, "*b R S w"], direction: Float[Tensor, "R 3"]) -> Light:
         """Light of samples of rays in directions of length 1."""
-        seen_from = self.seen_from(encoded(direction, self.settings.direction_octaves))
+        seen_from = self.seen_from(encoded(direction, self.direction_powers))
         seen = functional.relu(self.seen(self.bottleneck(trunk)) + seen_from[:, None])
         found = self.light_head(seen).float()
         return Light(found[..., 0].abs(), torch.sigmoid(found[..., 1:]))

@@ -150,6 +150,10 @@ class Draw:
         return {"host": self.host.get_state(), "device": self.device.get_state()}
 
     def restore(self, states: dict[str, Tensor]) -> None:
-        """Go on where a checkpoint was written."""
+        """Go on where a checkpoint was written; on another kind of device with other numbers."""
         self.host.set_state(states["host"].cpu())
-        self.device.set_state(states["device"].cpu())
+        state = states["device"].cpu()
+        if len(state) == len(self.device.get_state()):
+            self.device.set_state(state)
+        else:
+            self.device.manual_seed(int(torch.randint(1 << 62, (), generator=self.host)))

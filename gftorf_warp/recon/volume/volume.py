@@ -55,6 +55,8 @@ class Volume(torch.nn.Module, abc.ABC):
     """What is as published, in sentences."""
     assumed: ClassVar[tuple[str, ...]]
     """What was not published, or is done in another way, in sentences."""
+    axis_scale: Float[Tensor, "3"]
+    """``SCALED`` on the device."""
 
     def __init__(self, settings: VolumeSettings, box: Box, generator: torch.Generator):
         """Create random networks.
@@ -74,6 +76,8 @@ class Volume(torch.nn.Module, abc.ABC):
                 f"time and ftorf has none"
             )
         self.settings, self.box = settings, box
+        # an upload in every step would make a GPU wait
+        self.register_buffer("axis_scale", torch.tensor(SCALED), persistent=False)
         self.codes = TimeCodes(settings.network, box.frames, box.cycle, generator)
         self.moving = VolumeNetwork(settings.network, self.codes.size, generator)
         self.resting = (
@@ -101,8 +105,7 @@ class Volume(torch.nn.Module, abc.ABC):
     def unit(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Points [m] in the units of the networks."""
         near, far = self.box.bounds
-        scale = points.new_tensor(SCALED) / (far - near)
-        return 2.0 * (points * scale - 0.5)
+        return 2.0 * (points * (self.axis_scale / (far - near)) - 0.5)
 
     def trunk(
         self, points: Float[Tensor, "T R S 3"], quartets: list[int]
