@@ -1,8 +1,8 @@
 """Configuration of the documentation: `sphinx-build -W -b html docs build`.
 
 Pages are Markdown files of docs/, written by hand, and those that are made at the start of every
-build in docs/generated/: a reference from the code (reference.py), and the pages of the repository
-outside docs/ (repository.py).
+build in docs/generated/: a reference from the code (reference.py), pictures (pictures.py), and the
+pages of the repository outside docs/ (repository.py).
 """
 
 import sys
@@ -11,7 +11,8 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent), str(DOCS.parent / "tests")]
 
-import reference  # noqa: E402 - its folder is not a package
+import pictures  # noqa: E402 - its folder is not a package
+import reference  # noqa: E402
 import repository  # noqa: E402
 
 from gftorf_warp import __version__  # noqa: E402
@@ -26,7 +27,7 @@ exclude_patterns = ["_build"]
 root_doc = "index"
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["attrs_inline"]
+highlight_language = "none"  # commands and what they print
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
@@ -45,6 +46,7 @@ def generate(_app, _config) -> None:
     folder = DOCS / "generated"
     repository.write(folder)
     reference.write(folder)
+    pictures.write(folder)
 
 
 def keep_colons(_app, what, _name, _thing, _options, lines) -> None:

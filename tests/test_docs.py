@@ -9,7 +9,10 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
+import gftorf_warp
 from gftorf_warp import options
+from gftorf_warp.data import capture_write
+from gftorf_warp.recon import state
 from gftorf_warp.recon.settings import ReconSettings, Weights
 from gftorf_warp.scene.sensor import Sensor
 
@@ -83,3 +86,12 @@ def test_links_of_pages_that_are_made_stay():
     repository.resolve_links(None, "generated/settings", source)
     assert source == ["[Presets](../presets.md)"]
     assert repository.place_of("docs/view.md") == PurePosixPath("view.md")
+
+
+def test_stated_versions_are_those_of_the_code():
+    """The table of file formats, and the citation."""
+    page = (REPOSITORY / "docs" / "versions.md").read_text(encoding="utf-8")
+    assert f"| `version` | {capture_write.VERSION} | 1.x |" in page
+    assert f"| `format` | {state.FORMAT} | 1 to {state.FORMAT} |" in page
+    citation = (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {gftorf_warp.__version__}\n" in citation
