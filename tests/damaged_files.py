@@ -3,6 +3,7 @@
 Used by test_damaged_files.py, for a few seconds, and by benchmarks/fuzz.py, for as long as wanted.
 """
 
+import atexit
 import functools
 import hashlib
 import os
@@ -213,7 +214,9 @@ READERS |= IMPORTS
 @functools.cache
 def whole(name: str) -> Path:
     """The undamaged folder of a reader, made once in a process."""
-    folder = Path(tempfile.mkdtemp(prefix="foreign-")) / "whole"
+    place = Path(tempfile.mkdtemp(prefix="whole-"))
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    folder = place / "files"
     if READERS[name].make not in (make_ftorf, make_run) and "capture" not in name:
         folder.mkdir()
     READERS[name].make(folder)
