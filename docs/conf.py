@@ -1,8 +1,8 @@
 """Configuration of the documentation: `sphinx-build -W -b html docs build`.
 
 Pages are Markdown files of docs/, written by hand, and those that are made at the start of every
-build in docs/generated/: a reference from the code (reference.py), pictures (pictures.py), and the
-pages of the repository outside docs/ (repository.py).
+build in docs/generated/: a reference from the code (reference.py), pictures (pictures.py), scripts
+and scenes (gallery.py), and the pages of the repository outside docs/ (repository.py).
 """
 
 import sys
@@ -11,7 +11,8 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent), str(DOCS.parent / "tests")]
 
-import pictures  # noqa: E402 - its folder is not a package
+import gallery  # noqa: E402 - its folder is not a package
+import pictures  # noqa: E402
 import reference  # noqa: E402
 import repository  # noqa: E402
 
@@ -37,6 +38,8 @@ python_maximum_signature_line_length = 80
 
 html_theme = "furo"
 html_title = "gftorf_warp"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 
@@ -47,6 +50,7 @@ def generate(_app, _config) -> None:
     repository.write(folder)
     reference.write(folder)
     pictures.write(folder)
+    gallery.write(folder)
 
 
 def keep_colons(_app, what, _name, _thing, _options, lines) -> None:
