@@ -14,6 +14,7 @@ from waits import Operations
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.export.command import export
 from gftorf_warp.recon import checkpoint, presets
 from gftorf_warp.recon.observations import observe, reduced
 from gftorf_warp.recon.record import Metrics
@@ -148,15 +149,22 @@ def test_a_run_is_rendered_compared_and_reported(tmp_path):
 
 
 def test_colour_is_fitted_in_every_other_step(tmp_path):
-    """With colour images, odd steps compare them; the rendering has the units of the file."""
-    sequence = with_colour(as_phasors(recording(frames=8)[0]), size=(12, 9))
-    run = reconstruct(sequence, tmp_path / "run", toy("torf", images=60))
+    """With colour images, odd steps compare them; the rendering has the units of the file, and is
+    exported.
+    """
+    sequence = with_colour(recording(frames=8)[0], size=(12, 9))
+    path = write("capture", tmp_path / "seq", sequence)
+    run = reconstruct(path, tmp_path / "run", toy("torf", images=60))
     rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["colour"] < 0.5 * rows[0]["colour"]
     assert rows[-1]["loss"] == pytest.approx(0.5 * (rows[-1]["colour"] + rows[-1]["quads"]))
     colour = run.render(0.0).colour
     assert colour.shape == (3, 36, 48)
     assert 5.0 < colour.mean() < 40.0  # of images between 4 and 36
+    (folder,) = export(run, tmp_path / "out", "npz", times=[0.0])
+    with np.load(folder / "frame_0000.npz") as stored:
+        np.testing.assert_allclose(stored["colour"], colour.numpy(), rtol=1e-4)
+    export(run, tmp_path / "out", "points", times=[0.0], colour="colour")
 
 
 SPEED = 0.3  # [m] per quartet, along x
@@ -345,10 +353,11 @@ def test_contradictions_are_refused(tmp_path, name):
         ({"ablation": "h1"}, "no ablations"),
         ({"changes": ["weights.quads=0"]}, "weights.quads"),
         ({"changes": ["volume.samples=1"]}, "volume.samples"),
+        ({"settings": "ftorf", "changes": ["weights.colour=1"]}, "weights.colour"),
         ({"changes": [f"volume.network.static={name == 'ftorf'}"]}, "volume.network.static"),
     ):
         with pytest.raises(UsageError, match=what):
-            reconstruct(sequence, tmp_path / "run", name, **given)
+            reconstruct(sequence, tmp_path / "run", **({"settings": name} | given))
     assert not (tmp_path / "run").exists()
 
 

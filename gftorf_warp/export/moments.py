@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import UsageError
 from ..evaluate.views import views_to_take
-from ..recon.run import Run
+from ..recon.run import Run, VolumeRun
 from ..scene.camera import Camera
 
 Progress = Callable[[int, int], None]
@@ -71,6 +71,8 @@ class Moments:
     @property
     def has_colour(self) -> bool:
         """Whether colour can be rendered."""
+        if isinstance(self.run, VolumeRun):
+            return self.run.volume.box.colour
         return self.run.field.colour_sh is not None
 
     def path(self, folder: Path, index: int, suffix: str) -> Path:

@@ -161,6 +161,13 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why="torf blends a network without time, ftorf has none",
             fix="leave volume.network.static out",
         )
+    if settings.method == Method.FTORF and settings.weights.colour > 0:
+        raise UsageError(
+            "weights.colour does not fit preset ftorf",
+            where="--set",
+            why="it is fitted to raw frames alone",
+            fix="leave weights.colour out, or use --preset torf",
+        )
     if wanted is not None and not settings.weights.quads > 0:
         raise UsageError(
             f"weights.quads = {settings.weights.quads} does not fit preset {settings.preset}",
