@@ -186,7 +186,7 @@ def test_flow_of_the_second_folder_counts_only_if_the_first_is_empty(folder):
     got = Sequence.open(folder)
     assert list(got.flow.forward) == [4]
     assert got.flow.forward[4][1, 0, 0] == 3.0
-    assert got.sources["forward_flow"] == "file forward_flow_2, 1 images; 1 of later frames ignored"
+    assert got.sources["forward_flow"] == "file forward_flow_2, 1 images; 1 of other frames ignored"
 
 
 @pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", "<i2", "<u2"])

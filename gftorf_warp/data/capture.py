@@ -29,8 +29,10 @@ from .untrusted import FRAMES_MAX, SIDE_MAX, read_bytes, read_text
 T = TypeVar("T")
 
 
-def read(root: Path, frame_rate_hz: float | None) -> Sequence:
+def read(root: Path, frame_rate_hz: float | None, wanted: range | None = None) -> Sequence:
     """Read a capture: raw frames, calibration, colour, flow and novel views, never truth.
+
+    Of the images, those of the ``wanted`` raw frames, which ``quads`` are then; None: all.
 
     Raises:
         InputError: If a file is not what data_specs/capture.toml describes; lists all problems.
@@ -46,32 +48,33 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     digests = _manifest(root)
     width, height = (int(n) for n in values["size"])
     measured, frames = values["measured"], len(values["id"])
-    files = _files(root, "tof", frames, digests, problems)
-    for n in sorted({*np.flatnonzero(measured).tolist()} - files.keys()):
+    wanted = range(frames) if wanted is None else wanted
+    files = _files(root, "tof", frames, digests, problems, wanted)
+    for n in sorted({*np.flatnonzero(measured).tolist()} & {*wanted} - files.keys()):
         why = f"expected a file for every measured raw frame, found none for {n}"
         fix = "complete the folder, or set measured to false"
         problems.add("quads: no such file", root / "tof", why, fix)
-    quads = empty_quads(root, frames, {"H": height, "W": width})
+    quads = empty_quads(root, len(wanted), {"H": height, "W": width})
     images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "tap_sums": {}, "colour": {}}
     for n, file, parts in _read(root, files, digests, problems):
         if not measured[n]:
             continue
         quad = problems.attempt(_image, file, parts, "quads", (height, width))
         if quad is not None:
-            quads[n] = quad
+            quads[n - wanted.start] = quad
         for name in ("forward_flow", "backward_flow", "tap_sums"):
             image = problems.attempt(_image, file, parts, name, (height, width))
             if image is not None:
                 images[name][n] = image
     colour_size = tuple(values["colour_size"][::-1].tolist()) if "colour_size" in values else None
-    coloured = _files(root, "colour", frames, digests, problems)
+    coloured = _files(root, "colour", frames, digests, problems, wanted)
     for n, file, parts in _read(root, coloured, digests, problems):
         image = problems.attempt(_image, file, parts, "colour", colour_size)
         if image is not None:
             images["colour"][n] = image
     problems.raise_if_any(root)
     zero = float(values.get("adc_zero", 0.0))
-    subtract_zero(quads, measured, zero)
+    subtract_zero(quads, measured[wanted.start : wanted.stop], zero)
     frequencies = values["f_mod_hz"]
     lens = tuple(values["distortion"].tolist()) if "distortion" in values else None
 
@@ -110,22 +113,23 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     )
 
 
-def read_truth(root: Path, frames: int) -> Truth | None:
+def read_truth(root: Path, wanted: range) -> Truth | None:
     """Read the ground truth: both distances, amplitude, objects and layers; None if there is none.
 
     A layer is NaN in raw frames without it; parts that data_specs/capture.toml does not describe
-    are ignored. ``frames`` is the number F of raw frames of the sequence.
+    are ignored. ``wanted`` are the F raw frames of the sequence.
 
     Raises:
         InputError: If an image is not what data_specs/capture.toml describes.
     """
     problems = Problems()
     digests = _manifest(root)
-    files = _files(root, "truth", frames, digests, problems)
+    values = read_values(root)
+    files = _files(root, "truth", len(values["id"]), digests, problems, wanted)
     problems.raise_if_any(root)
     if not files:
         return None
-    values = read_values(root)
+    frames = len(wanted)
     width, height = (int(n) for n in values["size"])
     stacks: dict[str, np.ndarray] = {}
     layers: dict[str, np.ndarray] = {}
@@ -141,13 +145,13 @@ def read_truth(root: Path, frames: int) -> Truth | None:
             if name != "object" and (image < 0).any():
                 why = f"expected 0 or more, or NaN where unknown, found {np.nanmin(image):g}"
                 problems.add(f"{name}: negative", file, why, "store NaN where it is unknown")
-            stacks[name][n] = image
-            known[n] |= name == "distance"
+            stacks[name][n - wanted.start] = image
+            known[n - wanted.start] |= name == "distance"
         for name in parts:
             image = problems.attempt(_layer, file, parts, name, (height, width))
             if image is not None:
                 empty_layer = np.full((frames, *image.shape), np.nan, dtype=np.float32)
-                layers.setdefault(name, empty_layer)[n] = image
+                layers.setdefault(name, empty_layer)[n - wanted.start] = image
     problems.raise_if_any(root)
     if "distance" not in stacks:
         return None
@@ -165,10 +169,15 @@ def read_truth(root: Path, frames: int) -> Truth | None:
 
 
 def _files(
-    root: Path, folder: str, frames: int, digests: dict[str, str], problems: Problems
+    root: Path,
+    folder: str,
+    frames: int,
+    digests: dict[str, str],
+    problems: Problems,
+    wanted: range,
 ) -> dict[int, Path]:
-    """Files of raw frames in a folder; other ids are errors, and so is a missing file that the
-    manifest names, unless the whole folder is gone.
+    """Files of the wanted raw frames in a folder; ids of none of all ``frames`` are errors, and so
+    is a missing file that the manifest names, unless the whole folder is gone.
     """
     found = numbered(root, f"{folder}/{{id}}.exr")
     for n, file in found.items():
@@ -179,7 +188,7 @@ def _files(
         if name.startswith(f"{folder}/") and not os.path.lexists(root / name):
             why, fix = f"{MANIFEST} names it", f"restore it, or remove {MANIFEST}"
             problems.add("no such file", root / name, why, fix)
-    return {n: file for n, file in found.items() if n < frames}
+    return {n: file for n, file in found.items() if n in wanted}
 
 
 def _manifest(root: Path) -> dict[str, str]:

@@ -61,10 +61,13 @@ class Stored:
         return first_size(self.files, specs.fields(self.form)[self.field], problems)
 
 
-def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
+def read_sequence(
+    stored: Stored, frame_rate_hz: float | None, wanted: range | None = None
+) -> Sequence:
     """Read the images, calibration, colour, flow and novel views of a folder, never truth or masks.
 
     ``frame_rate_hz`` are images per second; None: the folder's times, or else the default rate.
+    Of the images, those of the ``wanted`` raw frames, which ``quads`` are then; None: all.
 
     Raises:
         InputError: If a file is not what data_specs/ describes; names all of them at once.
@@ -84,11 +87,13 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     count = count if times is None else len(times)
     shifts = problems.attempt(read_shifts, root, form, step * count, sources)
     poses = problems.attempt(read_poses, root, form, count, sources)
+    wanted = range(step * count) if wanted is None else wanted
+    chosen = range(wanted.start // step, wanted.stop // step)
     images: dict[str, dict[int, np.ndarray]] = {"forward_flow": {}, "backward_flow": {}}
     for name in ("colour", *images):
         if name in fields:
             images[name], sources[name] = read_field(
-                root, fields[name], count, size, problems, stored.first_id
+                root, fields[name], chosen, size, problems, stored.first_id
             )
     colour = ColourCamera(images={step * i: image for i, image in images["colour"].items()})
     intrinsics = colour_poses = None
@@ -101,16 +106,22 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
         if poses is not None:
             colour_poses = problems.attempt(read_colour_poses, root, form, poses, sources)
     novel = problems.attempt(read_novel, root, form, sources)
-    quads = empty_quads(root, step * count, size)
-    raw, sources["quads"] = load(root, fields[stored.field], stored.files, size, problems)
+    quads = empty_quads(root, len(wanted), size)
+    files = {i: file for i, file in stored.files.items() if i in chosen}
+    raw, sources["quads"] = load(root, fields[stored.field], files, size, problems)
     for i, image in raw.items():
-        quads[step * i : step * (i + 1)] = image if step == 1 else _quads_of(image)
+        row = step * i - wanted.start
+        quads[row : row + step] = image if step == 1 else _quads_of(image)
     problems.raise_if_any(root)
     assert times is not None
     assert shifts is not None
     assert poses is not None
     measured = np.isin(np.arange(count), list(stored.files))
-    subtract_zero(quads, np.repeat(measured, step), calibrated.calibration.adc_zero)
+    subtract_zero(
+        quads,
+        np.repeat(measured, step)[wanted.start : wanted.stop],
+        calibrated.calibration.adc_zero,
+    )
     sources["measured"] = f"file {len(stored.files)} of {count} {stored.counted}{stored.note}"
     kind = "raw quads" if step == 1 else "phasors"
     sources["from_phasors"] = f"{sources['quads'].partition(',')[0]}: {kind}"
@@ -139,9 +150,9 @@ def _quads_of(phasor: np.ndarray) -> tuple[np.ndarray, ...]:
     return re, -re, im, -im
 
 
-def read_distances(stored: Stored, frames: int) -> Truth | None:
-    """Read the true distances stored with a sequence of F = ``frames`` raw frames, each for all raw
-    frames of its image; None if there are none.
+def read_distances(stored: Stored, wanted: range) -> Truth | None:
+    """Read the true distances stored with the F ``wanted`` raw frames, each for all raw frames of
+    its image; None if there are none.
 
     They are NaN where the file has NaN or 0, and at frames without a file.
 
@@ -151,12 +162,14 @@ def read_distances(stored: Stored, frames: int) -> Truth | None:
     root, step, fields, problems = stored.root, stored.step, specs.fields(stored.form), Problems()
     size = stored.size(problems)
     stacks: dict[str, Any] = {}
+    frames, chosen = len(wanted), range(wanted.start // step, wanted.stop // step)
     known = np.zeros(frames, dtype=bool)
     for name in ("distance", "phasor_distance"):
-        images, _ = read_field(root, fields[name], frames // step, size, problems, stored.first_id)
+        images, _ = read_field(root, fields[name], chosen, size, problems, stored.first_id)
         stack = np.full((frames, size.get("H", 1), size.get("W", 1)), np.nan, dtype=np.float32)
         for i, image in images.items():
-            frames_of = slice(step * i, step * (i + 1))
+            row = step * i - wanted.start
+            frames_of = slice(row, row + step)
             if name == "distance" and (image < 0).any():
                 folders = (numbered(root, pattern) for pattern in fields[name].paths)
                 file = next(filter(None, folders))[i + stored.first_id]

@@ -109,21 +109,21 @@ def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) ->
 def read_field(
     root: Path,
     spec: specs.Field,
-    frames: int,
+    frames: range,
     size: dict[str, int],
     problems: Problems,
     first_id: int = 0,
 ) -> tuple[dict[int, np.ndarray], str]:
-    """Images of one field from the best folder that has any, by frame below ``frames``, and their
+    """Images of one field from the best folder that has any, of ``frames`` and by frame, and their
     source; ``first_id`` is the id of frame 0.
     """
     for pattern in spec.paths:
         files = {n - first_id: file for n, file in numbered(root, pattern).items()}
         if files:
-            used = {n: file for n, file in files.items() if 0 <= n < frames}
+            used = {n: file for n, file in files.items() if n in frames}
             images, source = load(root, spec, used, size, problems)
             ignored = len(files) - len(used)
-            other = f"; {ignored} of later frames ignored" if ignored else ""
+            other = f"; {ignored} of other frames ignored" if ignored else ""
             return images, f"{source}, {len(used)} images{other}"
     return {}, "default none"
 

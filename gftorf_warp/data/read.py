@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from . import capture, ftorf, torf
+from .excerpt import excerpt
 from .family import read_distances, read_sequence
 from .folder import format_of
 from .sequence import Sequence, Truth
@@ -13,21 +14,37 @@ from .untrusted import check_links
 STORED = {"ftorf": ftorf.stored, "torf": torf.stored}
 
 
-def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
+def read(
+    path: str | Path, *, frame_rate_hz: float | None = None, frames: range | None = None
+) -> Sequence:
     """Read a capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
 
     ``frame_rate_hz`` are raw frames, or phasors of a ToeRF folder, per second; it overrides the
     times of the folder and the default of 120, or 30. A capture, which states every time, has none.
 
+    Of ``frames``, whole quartets in a row, alone are images read, see :func:`excerpt`; None: of all
+    raw frames.
+
     Raises:
-        InputError: If the folder or a file in it does not conform to data_specs/.
+        InputError: If the folder or a file in it does not conform to data_specs/, or there are no
+            such raw frames.
     """
-    root = Path(path)
+    found = _read(Path(path), frame_rate_hz, frames)
+    return found if frames is None else excerpt(found, frames, quads=found.quads)
+
+
+def read_without_images(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
+    """:func:`read`, with no image in memory: ``quads`` have the shape [0, H, W]."""
+    return _read(Path(path), frame_rate_hz, range(0))
+
+
+def _read(root: Path, frame_rate_hz: float | None, frames: range | None) -> Sequence:
+    """A sequence whose images, ``quads`` included, are those of some raw frames; None: of all."""
     form = format_of(root)
     check_links(root)
     if form == capture.FORMAT:
-        return capture.read(root, frame_rate_hz)
-    return read_sequence(STORED[form](root), frame_rate_hz)
+        return capture.read(root, frame_rate_hz, frames)
+    return read_sequence(STORED[form](root), frame_rate_hz, frames)
 
 
 def read_truth(sequence: Sequence) -> Truth | None:
@@ -41,9 +58,10 @@ def read_truth(sequence: Sequence) -> Truth | None:
         return None
     form = format_of(root)
     check_links(root)
+    frames = range(sequence.frames) if sequence.excerpt is None else sequence.excerpt
     if form == capture.FORMAT:
-        return capture.read_truth(root, sequence.frames)
-    return read_distances(STORED[form](root), sequence.frames)
+        return capture.read_truth(root, frames)
+    return read_distances(STORED[form](root), frames)
 
 
 # methods of the public class; sequence.py does not import the readers, which import it

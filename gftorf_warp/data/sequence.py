@@ -137,6 +137,8 @@ class Sequence:
     """Source of each value by name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
     path: Path | None = None
     """The folder this was read from; None for a sequence that exists in memory only."""
+    excerpt: range | None = None
+    """The raw frames of the folder that these are; None: all of them."""
 
     @property
     def frames(self) -> int:
