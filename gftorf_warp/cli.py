@@ -211,23 +211,53 @@ def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
+    if options.window is not None:
+        return _reconstruct_in_windows(options)
+    if options.overlap is not None:
+        why, fix = "only windows have one", "add --window SECONDS, or leave it out"
+        raise UsageError("an overlap of nothing", where="--overlap", why=why, fix=fix)
     from .data.read import read
 
     sequence = read(options.sequence, frame_rate_hz=options.frame_rate)
     device = start(options, compile_first=False)
     from .recon.train import chosen_settings, reconstruct
 
-    changes = list(options.set)
-    if options.batch is not None:
-        changes.append("schedule.batch=" + {1: "frame", 4: "quartet"}[options.batch])
-    if options.deterministic:
-        changes.append("render.deterministic=true")
-    chosen = {**_named(options, "images", "input", "ablation", "flow"), "changes": changes}
+    chosen = _chosen(options)
     chosen_settings(sequence, options.preset, **chosen)  # refuses wrong ones before kernels compile
     compile_first_time(device)
     more = {**_named(options, "seed", "fresh"), "progress": _progress(options)("reconstruct")}
     print(reconstruct(sequence, options.out, options.preset, **chosen, device=device, **more).path)
     return 0
+
+
+def _reconstruct_in_windows(options: argparse.Namespace) -> int:
+    device = start(options)
+    from .recon.windowed import reconstruct_in_windows
+
+    run = reconstruct_in_windows(
+        options.sequence,
+        options.out,
+        options.preset,
+        window_s=options.window,
+        overlap_s=options.overlap,
+        frame_rate_hz=options.frame_rate,
+        device=device,
+        progress=_progress(options)("reconstruct"),
+        **_named(options, "seed", "fresh"),
+        **_chosen(options),
+    )
+    print(run.path)
+    return 0
+
+
+def _chosen(options: argparse.Namespace) -> dict[str, Any]:
+    """What options change in a preset."""
+    changes = list(options.set)
+    if options.batch is not None:
+        changes.append("schedule.batch=" + {1: "frame", 4: "quartet"}[options.batch])
+    if options.deterministic:
+        changes.append("render.deterministic=true")
+    return {**_named(options, "images", "input", "ablation", "flow"), "changes": changes}
 
 
 def _render(options: argparse.Namespace) -> int:

@@ -206,6 +206,10 @@ def command_parsers() -> dict[str, Parser]:
         "--flow", "KIND", str, f"auto, file, dis, deepflow or none: optical flow, {flows}"
     )
     reconstruct.option("--seed", "S", _whole, "seed of the optimiser (0)", 0)
+    window = "reconstruct a long recording in windows of at most so long; --images are per window"
+    reconstruct.option("--window", "SECONDS", _number, window)
+    overlap = "what neighbouring windows share, at least (two quartets)"
+    reconstruct.option("--overlap", "SECONDS", _number, overlap)
     reconstruct.option("--frame-rate", "HZ", _rate, "raw frames per second (the file's, or 120)")
     _device_options(reconstruct)
     reconstruct.flag("--fresh", FRESH)

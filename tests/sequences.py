@@ -32,7 +32,8 @@ PARTS = {  # part of a sequence: (its class, {flat name: name in the part})
     ),
     "flow": (Flow, {"forward_flow": "forward", "backward_flow": "backward"}),
 }
-NAMES = {f.name for f in dataclasses.fields(Sequence)} - PARTS.keys() - {"sources", "path"}
+ABOUT = {"sources", "path", "excerpt"}  # where the values are from
+NAMES = {f.name for f in dataclasses.fields(Sequence)} - PARTS.keys() - ABOUT
 NAMES |= {name for _, names in PARTS.values() for name in names}
 
 
@@ -51,7 +52,7 @@ def sequence_of(**values):
 
 
 def values_of(sequence):
-    """The values of a sequence by their flat names, without its sources and path."""
+    """The values of a sequence by their flat names, without where they are from."""
     values = {
         name: getattr(sequence, name)
         for name in NAMES
@@ -64,5 +65,5 @@ def values_of(sequence):
 
 def changed(sequence, **values):
     """A sequence with other values, by their flat names."""
-    kept = {name: getattr(sequence, name) for name in ("sources", "path")}
+    kept = {name: getattr(sequence, name) for name in ABOUT}
     return sequence_of(**kept | values_of(sequence) | values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,6 @@ from jaxtyping import Float
 from ..errors import InputError
 from .sequence import Flow, Sequence
 
-Rows = TypeVar("Rows", bound="np.ndarray | None")
 Image = TypeVar("Image")
 
 
@@ -38,8 +37,8 @@ def excerpt(
     if first % cycle:
         raise ValueError(f"an excerpt begins with a quartet of {cycle} raw frames, got {first}")
 
-    def rows(array: Rows) -> Rows:
-        return None if array is None else array[first : frames.stop].copy()  # type: ignore[return-value]
+    def rows(array: Any) -> Any:
+        return None if array is None else array[first : frames.stop].copy()
 
     def images(by_frame: dict[int, Image], other: int = 0) -> dict[int, Image]:
         """Images of the raw frames, and to raw frames ``other`` later among them."""

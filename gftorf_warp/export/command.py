@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
 from ..recon.folder import set_aside
+from ..recon.joined import refused
 from ..recon.run import Run
 from . import cameras, film, images, mesh, points, scene_page, splats
 from .moments import Moments, Progress
@@ -125,6 +126,8 @@ def check_content(moments: Moments, names: Iterable[str], colour: str) -> None:
     """
     run = moments.run
     lacking = [name for name in names if FORMATS[name].of_gaussians]
+    if lacking and run.config.get("windows"):
+        raise refused(run.path)
     if lacking and not len(run.field):
         why = f"its method {run.config['settings'].get('method')} fits none"
         fix = f"leave {', '.join(lacking)} out: points, mesh and images need none"

@@ -36,6 +36,7 @@ def config_of(
         "threads": available_threads() if torch.device(device).type == "cpu" else None,
         "sequence": None if sequence.path is None else str(sequence.path.resolve()),
         "data_sha256": data_hash(sequence),
+        "excerpt": sequence.excerpt and [sequence.excerpt.start, sequence.excerpt.stop],
         "frames": sequence.frames,
         "frame_rate_hz": _rate(sequence),
         "times": sequence.sources.get("times"),

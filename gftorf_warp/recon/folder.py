@@ -22,7 +22,8 @@ FRESH = (
     "continue with the same settings, choose another --out, or start over with --fresh (the "
     "old run is kept aside)"
 )
-IDENTITY = ("seed", "data_sha256")  # besides the settings: what has to agree for a run to go on
+IDENTITY = ("seed", "data_sha256", "windows")
+"""What has to agree for a run to go on, besides the settings."""
 
 
 def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:

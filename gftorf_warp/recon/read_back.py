@@ -18,6 +18,7 @@ from ..scene.camera import Camera
 from ..scene.distortion import Distortion as Lens
 from ..scene.sensor import Sensor
 from .folder import CONFIG, read_config
+from .joined import Window
 from .settings import FlowSource, Method
 from .volume.settings import settings_of
 
@@ -38,6 +39,9 @@ OPTIONAL: dict[str, Any] = {
     "colour_scale": NUMBER | None,
     "data_sha256": str | None,
     "edited_from": str | None,
+    "excerpt": list | None,
+    "windows": list | None,
+    "gaussians": int | None,
     "frame_rate_hz": NUMBER | None,
     "times": str | None,
     "changes": list | None,
@@ -86,6 +90,10 @@ def read_back(run: Path) -> ReadBack:
     try:
         camera, sensor = _camera(config["camera"]), _sensor(config["sensor"])
         render_settings(config)
+        for stored in config.get("windows") or ():
+            Window.of(stored)
+        if config.get("excerpt"):
+            range(*config["excerpt"])
         FlowSource(config["settings"].get("flow", FlowSource.AUTO))
         if Method(config["settings"].get("method", Method.GAUSSIANS)).is_volume:
             settings_of(config["settings"]["volume"])

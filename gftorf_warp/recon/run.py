@@ -35,6 +35,7 @@ from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
 from . import checkpoint, closed_form, edits, outlines, source
 from .fallback import Fallback
+from .joined import Joined, Window, folder_of, refused
 from .read_back import read_back, render_settings
 from .residuals import Residuals, residuals
 from .settings import FlowSource, Method
@@ -80,6 +81,8 @@ class Run:
         path = Path(path)
         found = read_back(path)
         config, camera, sensor = found.config, found.camera, found.sensor
+        if config.get("windows"):
+            return WindowedRun.of_windows(path, config, camera, sensor, device)
         kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal, Method.FLOW2D: Flow2D}
         method = Method(config["settings"].get("method", Method.GAUSSIANS))
         if (kind := kinds.get(method)) is not None:
@@ -450,6 +453,101 @@ class Flow2D(ClosedForm):
     def _shown(self, time: float) -> Sequence:
         matcher = FlowSource(self.config["settings"]["flow"]).matcher
         return synchronised(self._measured, time, matcher).sequence
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WindowedRun(WithoutGaussians):
+    """A run of a long recording, whose windows are runs of their own, see joined.py.
+
+    Times are those of the recording. Two windows are in memory at a time.
+    """
+
+    joined: Joined[Run]
+    """Its windows."""
+
+    @classmethod
+    def of_windows(
+        cls,
+        path: Path,
+        config: dict,
+        camera: Camera,
+        sensor: Sensor,
+        device: torch.device | str,
+    ) -> Self:
+        """The run of a folder that holds windows.
+
+        Raises:
+            InputError: If not all of them are reconstructed.
+        """
+        source.check_windows(path, config)
+
+        def opened(number: int) -> Run:
+            window = Run.open(folder_of(path, number), device)
+            return replace(window, config=window.config | {"sequence": config["sequence"]})
+
+        windows = [Window.of(stored) for stored in config["windows"]]
+        return cls.of(path, config, camera, sensor, device, joined=Joined(windows, opened))
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians of all windows."""
+        return int(self.config["gaussians"])
+
+    def render(
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "0 D"] | None = None,
+        f_mod_hz: float | None = None,
+    ) -> Rendering:
+        """What the sensor would see at one instant; as :meth:`Run.render`, extra channels are 0."""
+        fits = Method(self.config["settings"].get("method", Method.GAUSSIANS)).fits
+        if fits:
+            camera = camera or self.camera
+        rendering = self.joined.rendered(
+            time, lambda window, local: window.render(local, camera, f_mod_hz=f_mod_hz)
+        )
+        if extra is None:
+            return rendering
+        size = rendering.distance.shape
+        return replace(rendering, extra=rendering.distance.new_zeros(extra.shape[1], *size))
+
+    def renderer(
+        self,
+        images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
+        *,
+        f_mod_hz: float | None = None,
+        corrected: bool = True,
+    ) -> Callable[[float, Camera], Rendering]:
+        """As :meth:`Run.renderer`."""
+        names = tuple(images)
+        renderers: Joined[Callable[[float, Camera], Rendering]] = self.joined.mapped(
+            lambda window: window.renderer(names, f_mod_hz=f_mod_hz, corrected=corrected)
+        )
+        return lambda time, camera: renderers.rendered(
+            time, lambda render, local: render(local, camera)
+        )
+
+    def corrected(
+        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
+    ) -> Rendering:
+        """As :meth:`Run.corrected`, by the windows of the time."""
+        return self.joined.rendered(
+            time, lambda window, local: window.corrected(rendering, local, camera, f_mod_hz)
+        )
+
+    def edited(self, field: GaussianField, rows: Int[Tensor, "N"] | None = None) -> Run:  # noqa: ARG002
+        """Refused.
+
+        Raises:
+            UsageError: Always: each window has Gaussians of its own.
+        """
+        raise refused(self.path)
+
+    def save(self, out: str | Path) -> Run:  # noqa: ARG002
+        """Refused, as :meth:`edited`."""
+        raise refused(self.path)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

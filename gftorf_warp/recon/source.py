@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..data.excerpt import excerpt
 from ..data.read import read
 from ..data.sequence import Sequence
 from ..errors import InputError, UsageError
 from . import folder
+from .joined import Window, folder_of
 from .observations import data_hash
 
 LOG = logging.getLogger("gftorf_warp")
@@ -63,17 +65,45 @@ def remember(run: Path, source: Path) -> None:
 
 
 def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
-    """A sequence with the hash that a config states; runs of before 0.1.0 state none."""
+    """A sequence with the hash that a config states, or the configs of all its windows; runs of
+    before 0.1.0 state none.
+    """
     given = str(config.get("times") or "").startswith("setting")
-    sequence = read(source, frame_rate_hz=config["frame_rate_hz"] if given else None)
-    wanted = config.get("data_sha256")
-    if wanted is not None and (found := data_hash(sequence)) != wanted:
-        why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {found[:12]}..."
-        fix = "name the sequence of the run with --sequence SEQ, or reconstruct this one"
-        raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
+    frames = range(*config["excerpt"]) if config.get("excerpt") else None
+    rate = config["frame_rate_hz"] if given else None
+    sequence = read(source, frame_rate_hz=rate, frames=frames)
+    _check_hash(source, run, config, sequence)
+    for number, stored in enumerate(config.get("windows") or ()):
+        own, part = folder_of(run, number), excerpt(sequence, Window.of(stored).frames)
+        _check_hash(source, own, folder.read_config(own), part)
     camera, size = config["camera"], (sequence.width, sequence.height)
     if (camera["width"], camera["height"]) != size:
         why = f"{run} has {camera['width']}x{camera['height']} pixels, this {size[0]}x{size[1]}"
         fix = "restore config.json from a copy"
         raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
     return sequence
+
+
+def _check_hash(source: Path, run: Path, config: Mapping[str, Any], sequence: Sequence) -> None:
+    """Raise an InputError if a sequence has another hash than the config of a run states."""
+    wanted = config.get("data_sha256")
+    if wanted is not None and (found := data_hash(sequence)) != wanted:
+        why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {found[:12]}..."
+        fix = "name the sequence of the run with --sequence SEQ, or reconstruct this one"
+        raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
+
+
+def check_windows(run: Path, config: Mapping[str, Any]) -> None:
+    """Check that all windows of a run are finished.
+
+    Raises:
+        InputError: If not.
+    """
+    count = len(config["windows"])
+    windows = [folder_of(run, number) for number in range(count)]
+    for done, own in enumerate([*windows, run]):
+        there = (own / folder.CONFIG).is_file()
+        if not there or folder.read_config(own).get("images_optimised") is None:
+            why = f"the first {done} of {count} windows are finished"
+            fix = "repeat its `gftorf reconstruct`, which goes on there"
+            raise InputError("the run is not finished", where=own, why=why, fix=fix)
