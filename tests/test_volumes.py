@@ -445,6 +445,15 @@ def test_a_checkpoint_without_moments_is_named(tmp_path):
         reconstruct(small(), tmp_path / "run", toy("ftorf", images=4))
 
 
+def test_pixels_without_light_have_no_bounds():
+    """Nothing is decoded there: a sample at distance 0 would be infinitely bright."""
+    sequence, settings = small(), toy("torf")
+    dark = sequence.quads.copy()
+    dark[:, :, :3] = 0.0
+    found = Targets(observe(replace(sequence, quads=dark), settings, "cpu")).bounds()
+    assert found == pytest.approx(targets_of(settings).bounds(), rel=0.2)
+
+
 def targets_of(settings):
     """What a volume of the small recording is compared with."""
     return Targets(observe(small(), settings, "cpu"))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ...data.decode import closed_form_distance
+from ...data.decode import closed_form_distance, quartet_phasor
 from ..observations import ImageStack, Observations
 from .rays import Views, mean_pose
 
@@ -107,12 +107,15 @@ class Targets:
         return self.observations.sequence.times[:: self.cycle].tolist()
 
     def bounds(self) -> tuple[float, float]:
-        """z-depths [m] that hold what was decoded: 0.9 of the smallest, 1.1 of the largest."""
+        """z-depths [m] that hold what was decoded where there is light: 0.9 of the smallest, 1.1 of
+        the largest.
+        """
         sequence = self.observations.sequence
         cosine = self.camera.directions()[..., 2]
         quartets = sequence.complete_quartets
         decoded = torch.from_numpy(np.stack([closed_form_distance(sequence, i) for i in quartets]))
-        z = (decoded * cosine).flatten().float()
+        lit = np.stack([np.hypot(*quartet_phasor(sequence, i)) > 0.0 for i in quartets])
+        z = (decoded * cosine)[torch.from_numpy(lit)].float()
         z = z[:: max(1, len(z) // 1_000_000)]  # as many as a quantile takes
         near, far = torch.quantile(z, torch.tensor([OUTLIERS, 1.0 - OUTLIERS])).tolist()
         return NEARER * near, FARTHER * far
