@@ -31,8 +31,7 @@ myst_heading_anchors = 4
 highlight_language = "none"  # commands and what they print
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
+autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 80
 

@@ -14,7 +14,7 @@ from gftorf_warp import simulate
 from gftorf_warp.data.write import SHEET
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SLOW = ("06_moving_camera",)  # shown, but not run at every build
+SLOW = ("05_reconstruct", "06_moving_camera")  # shown, but not run at every build
 SCENES = ("sliding", "arc", "tour", "speed_test_chair", "pillow", "random-7")
 
 
@@ -32,9 +32,8 @@ def write(folder: Path) -> None:
 def section(path: Path) -> str:
     """Docstring, source and output of one script."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    title = path.stem.partition("_")[2].replace("_", " ").capitalize()
     source = f"../../examples/{path.name}\n:language: python\n:lines: {tree.body[1].lineno}-"
-    text = f"\n## {title}\n\n{ast.get_docstring(tree)}\n\n```{{literalinclude}} {source}\n```\n"
+    text = f"\n## {path.name}\n\n{ast.get_docstring(tree)}\n\n```{{literalinclude}} {source}\n```\n"
     return text if path.stem in SLOW else f"{text}\n```\n{printed(path)}```\n"
 
 

@@ -244,7 +244,11 @@ def python() -> str:
     """The public names with signatures and docstrings, as Sphinx directives."""
     names = [name for name in gftorf_warp.__all__ if name != "__version__"]
     objects = {name: getattr(gftorf_warp, name) for name in names}
-    text = "Python\n======\n\n.. module:: gftorf_warp\n\n"
+    text = (
+        "Python\n======\n\nThe public names: those of the package, then those of modules. Arrays "
+    )
+    text += "have their shape in brackets or in the annotation, numbers their unit.\n\n"
+    text += ".. module:: gftorf_warp\n\n"
     for name, thing in objects.items():
         kind = "autoclass" if inspect.isclass(thing) else "autofunction"
         text += f"{name}\n{'-' * len(name)}\n\n.. {kind}:: gftorf_warp.{name}\n"

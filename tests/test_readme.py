@@ -1,5 +1,5 @@
-"""Every `gftorf simulate` line of README.md, the quick start and docs/simulate.md is run at a tiny
-size; other commands are parsed.
+"""Every `gftorf simulate` line of README.md, the gallery, the quick start and docs/simulate.md is
+run at a tiny size; other commands are parsed.
 """
 
 import re
@@ -14,7 +14,7 @@ from gftorf_warp.sim.ladder import NAMES
 REPOSITORY = Path(__file__).parents[1]
 PAGES = "".join(
     (REPOSITORY / name).read_text(encoding="utf-8")
-    for name in ("README.md", "docs/quick-start.md", "docs/simulate.md")
+    for name in ("README.md", "docs/gallery.md", "docs/quick-start.md", "docs/simulate.md")
 )
 LINES = sorted(
     {
