@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from moving_box import recording
+from moving_box import recording, with_colour
 from small_runs import same, stored
 
 from gftorf_warp import Run
@@ -16,6 +16,8 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.read import read, read_without_images
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.evaluate.views import views_to_take
+from gftorf_warp.export.command import export
 from gftorf_warp.recon.joined import Joined, Window, blended, folder_of
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.recon.windowed import plan, reconstruct_in_windows
@@ -227,3 +229,16 @@ def test_an_overlap_needs_windows(folder, tmp_path, capsys):
     words = ["reconstruct", str(folder), "--out", str(tmp_path / "run"), "--overlap", "1"]
     assert main(words) == 2
     assert "--window" in capsys.readouterr().err
+
+
+def test_colour_of_windows_is_exported(tmp_path):
+    """In the units of the recording, as it is rendered."""
+    path = write("capture", tmp_path / "seq", with_colour(recording(frames=16)[0], size=(12, 9)))
+    windows = {"window_s": 2 * QUARTET, "overlap_s": 0.0}
+    changes = ["width_max=16", "weights.colour=1"]
+    given = {**windows, "images": 2, "flow": "none", "changes": changes}
+    run = reconstruct_in_windows(path, tmp_path / "run", "demo", **given)
+    (folder,) = export(run, tmp_path / "out", "npz", times=[0.1])
+    with np.load(folder / "frame_0000.npz") as found:
+        colour = run.render(0.1, views_to_take(run, run.sequence(), [0.1], None)[1][0]).colour
+        np.testing.assert_allclose(found["colour"], colour.numpy(), atol=1e-3)

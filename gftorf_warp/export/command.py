@@ -84,7 +84,7 @@ def export(
         why = f"expected {' or '.join(COLOURS)}"
         raise UsageError(f"unknown colour {colour!r}", where="--colour", why=why, fix=why)
     moments = Moments.of(run, times, every)
-    shown = colour or COLOURS[0 if moments.has_colour else 1]
+    shown = colour or COLOURS[0 if moments.run.has_colour else 1]
     targets = [out / FORMATS[name].target for name in names]
     check_content(moments, names, shown)
     check_targets(targets, fresh=fresh)
@@ -132,7 +132,7 @@ def check_content(moments: Moments, names: Iterable[str], colour: str) -> None:
         why = f"its method {run.config['settings'].get('method')} fits none"
         fix = f"leave {', '.join(lacking)} out: points, mesh and images need none"
         raise UsageError("no Gaussians to export", where=run.path, why=why, fix=fix)
-    if colour == "colour" and not moments.has_colour:
+    if colour == "colour" and not moments.run.has_colour:
         why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
         raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
 

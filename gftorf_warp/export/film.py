@@ -10,5 +10,5 @@ from .moments import Moments, Progress
 
 def write(moments: Moments, path: Path, progress: Progress) -> None:
     """Write a video, whose kind the suffix of the path is; see evaluate/video.py."""
-    what = ("distance", "colour") if moments.has_colour else ("distance",)
+    what = ("distance", "colour") if moments.run.has_colour else ("distance",)
     render_to_video(moments.run, path, what, moments.times, progress=progress)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import UsageError
 from ..evaluate.views import views_to_take
-from ..recon.run import Run, VolumeRun
+from ..recon.run import Run
 from ..scene.camera import Camera
 
 Progress = Callable[[int, int], None]
@@ -65,15 +65,8 @@ class Moments:
 
         Colour is left out if the run has none.
         """
-        wanted = set(names) - (set() if self.has_colour else {"colour"})
+        wanted = set(names) - (set() if self.run.has_colour else {"colour"})
         return self.run.images(self.times, self.cameras, sorted(wanted))
-
-    @property
-    def has_colour(self) -> bool:
-        """Whether colour can be rendered."""
-        if isinstance(self.run, VolumeRun):
-            return self.run.volume.box.colour
-        return self.run.field.colour_sh is not None
 
     def path(self, folder: Path, index: int, suffix: str) -> Path:
         """File of the index-th time: a common prefix and a number, as viewers of sequences want."""

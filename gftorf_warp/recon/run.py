@@ -152,6 +152,11 @@ class Run:
         return len(self.field)
 
     @property
+    def has_colour(self) -> bool:
+        """Whether colour can be rendered."""
+        return self.field.colour_sh is not None
+
+    @property
     def colour_scale(self) -> float:
         """The units of the sequence's colour images times this are those of the optimisation."""
         return float(self.config.get("colour_scale") or 1.0)
@@ -493,6 +498,11 @@ class WindowedRun(WithoutGaussians):
         """Number of Gaussians of all windows."""
         return int(self.config["gaussians"])
 
+    @property
+    def has_colour(self) -> bool:
+        """Whether colour can be rendered."""
+        return self.config.get("colour_scale") is not None
+
     def render(
         self,
         time: float,
@@ -556,6 +566,11 @@ class VolumeRun(WithoutGaussians):
 
     volume: Volume
     """What is seen."""
+
+    @property
+    def has_colour(self) -> bool:
+        """Whether colour can be rendered."""
+        return self.volume.box.colour
 
     def render(
         self,
