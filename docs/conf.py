@@ -29,6 +29,7 @@ root_doc = "index"
 
 myst_heading_anchors = 4
 highlight_language = "none"  # commands and what they print
+smartquotes = False  # they make a dash of the two hyphens of an option
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
