@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from moving_box import recording
 
 from gftorf_warp.cli import main
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, ResourceError
+from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
 from gftorf_warp.sweep.command import sweep
 from gftorf_warp.sweep.plan import Plan, Row, Scene, read_plan
@@ -230,3 +232,16 @@ def test_a_cluster_does_the_same_jobs(tmp_path):
         assert there[id]["metrics"]["d_mse_x100"] == here[id]["metrics"]["d_mse_x100"]
     with pytest.raises(ResourceError, match="no Dask scheduler answers"):
         sweep(tmp_path / "plan.toml", tmp_path / "nowhere", scheduler="tcp://127.0.0.1:9")
+
+
+def test_the_memory_of_a_job_is_not_that_of_the_one_before(monkeypatch):
+    """A process does several jobs; CUDA's peak is reset where there is a GPU in use only."""
+    forgotten = []
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", forgotten.append)
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: False)
+    forget_peak_memory("cuda:1")
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    forget_peak_memory("cpu")
+    assert forgotten == []
+    forget_peak_memory("cuda:1")
+    assert forgotten == ["cuda:1"]

@@ -193,8 +193,16 @@ def free_memory(device: torch.device | str) -> float | None:
     return None if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
 
 
+def forget_peak_memory(device: torch.device | str) -> None:
+    """Let :func:`peak_memory` count from here on."""
+    if torch.device(device).type != "cpu" and torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats(device)
+
+
 def peak_memory(device: torch.device | str) -> float | None:
-    """Largest memory of a GPU that torch has held in this process [B]; None for a CPU."""
+    """Largest memory of a GPU that torch has held in this process since
+    :func:`forget_peak_memory` [B]; None for a CPU.
+    """
     device = torch.device(device)
     return None if device.type == "cpu" else float(torch.cuda.max_memory_allocated(device))
 

@@ -22,7 +22,7 @@ from ..evaluate.panels import Findings, telling_row
 from ..recon.observations import data_hash
 from ..recon.settings import plain
 from ..recon.train import chosen_settings, reconstruct
-from ..render.cuda import peak_memory
+from ..render.cuda import forget_peak_memory, peak_memory
 from ..sim.simulate import simulate
 from ..terminal import start_warp
 from .plan import Job, Plan
@@ -117,6 +117,7 @@ def _fitted(task: Task, place: Place) -> Result:
         return {"key": key}
     chosen |= {"seed": job.seed, "device": place.device, "progress": _while_parent_lives()}
     folder, preset = run_of(job, task.out), job.row.preset
+    forget_peak_memory(place.device)  # of the job before in this process
     run = _patiently(lambda: reconstruct(sequence, folder, preset, **chosen))
     metrics, found = score(run, frames=plan.frames)
     _keep_picture(picture_of(job, task.out), found)
