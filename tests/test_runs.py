@@ -121,6 +121,8 @@ def test_names_are_as_short_as_they_differ(tmp_path):
     """One part where that is enough."""
     assert names_of([tmp_path / "a", tmp_path / "b"]) == ["a", "b"]
     assert names_of([tmp_path / "a" / "run", tmp_path / "b" / "run"]) == ["a/run", "b/run"]
+    above = tmp_path.name  # a run named truth would take its picture's place
+    assert names_of([tmp_path / "truth", tmp_path / "b"]) == [f"{above}/truth", f"{above}/b"]
 
 
 def test_what_differs_is_found_at_every_depth():

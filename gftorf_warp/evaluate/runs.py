@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..recon.run import Run
 
 NUMBERS, PAGE = "comparison.json", "comparison.html"
+OTHERS = (runs_page.CLOSED_FORM, runs_page.TRUTH)
 COLUMNS = {  # title of a column of the printed table: key of metrics.json, how it is printed
     "all": ("d_mse_x100", ".4g"),
     "moving": ("moving.d_mse_x100", ".4g"),
@@ -81,7 +82,8 @@ def compare_runs(
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """The last parts of each path, as few as tell all of them apart.
+    """The last parts of each path, as few as tell all of them apart, and from what else the page
+    shows.
 
     Raises:
         UsageError: If two are one folder.
@@ -93,7 +95,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
             raise UsageError("a run is named twice", where=path, why=why, fix=fix)
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]
-        if len({*names}) == len(names):
+        if len({*names, *OTHERS}) == len(names) + len(OTHERS):
             break
     return names
 

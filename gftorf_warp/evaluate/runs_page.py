@@ -15,7 +15,7 @@ from . import figures, page, panels, provenance, tables
 from .legend import TO_READ
 from .panels import Findings
 
-CLOSED_FORM = "closed form"
+CLOSED_FORM, TRUTH = "closed form", "truth"
 RUN_COLOURS = "#0072b2 #009e73 #e69f00 #cc79a7 #56b4e9 #8c6d31 #666666".split()  # Okabe and Ito
 SAID = {  # title of a column: key of metrics.json, how it is printed
     "quad PSNR": ("quad_psnr_db", "decibel"),
@@ -158,7 +158,7 @@ def _film(found: Findings, runs: Sequence[Scored]) -> list[str]:
     shown = {CLOSED_FORM: (found.views.closed_form, scale)}
     shown |= {run.name: (run.d, scale) for run in runs}
     if found.judgement is not None:
-        shown["truth"] = found.judgement.truth, scale
+        shown[TRUTH] = found.judgement.truth, scale
     html = panels.film(found, shown)
     text = "Distance at the first raw frame of every quartet, slowed down."
     return [page.section("Quartet by quartet", page.caption(text), html)] if html else []
@@ -182,7 +182,7 @@ def _pictures(found: Findings, runs: Sequence[Scored], s: int) -> list[str]:
     distances += [page.picture(run.d[s], metres, run.name) for run in runs]
     html = []
     if judged is not None:
-        distances.append(page.picture(judged.truth[s], metres, "truth"))
+        distances.append(page.picture(judged.truth[s], metres, TRUTH))
         scale = panels.error_scale(judged, s)
         wrong = {CLOSED_FORM: judged.errors["closed_form"]}
         wrong |= {run.name: run.error for run in runs if run.error is not None}
