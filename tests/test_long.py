@@ -1,6 +1,7 @@
 """Long recordings in windows: one run out of several, at every time of the recording."""
 
 import functools
+import gc
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 from moving_box import recording, with_colour
 from small_runs import same, stored
 
-from gftorf_warp import Run
+from gftorf_warp import Run, Sequence
 from gftorf_warp.cli import main
 from gftorf_warp.data.read import read, read_without_images
 from gftorf_warp.data.write import write
@@ -242,3 +243,21 @@ def test_colour_of_windows_is_exported(tmp_path):
     with np.load(folder / "frame_0000.npz") as found:
         colour = run.render(0.1, views_to_take(run, run.sequence(), [0.1], None)[1][0]).colour
         np.testing.assert_allclose(found["colour"], colour.numpy(), atol=1e-3)
+
+
+def test_a_window_leaves_nothing_in_memory(folder, tmp_path):
+    """When the next one begins, the sequence of the one before is gone."""
+    alive = {}
+
+    def count(*_, window, **__):
+        if window not in alive:
+            alive[window] = sum(type(one) is Sequence for one in gc.get_objects())
+
+    gc.collect()
+    gc.disable()
+    try:
+        START(folder, tmp_path / "run", progress=count)
+    finally:
+        gc.enable()
+    assert len(alive) == 3
+    assert len({*alive.values()}) == 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import gc
 import logging
 import math
 import weakref
@@ -487,6 +488,7 @@ class WindowedRun(WithoutGaussians):
         source.check_windows(path, config)
 
         def opened(number: int) -> Run:
+            gc.collect()  # a window that was closed may still refer to itself
             window = Run.open(folder_of(path, number), device)
             return replace(window, config=window.config | {"sequence": config["sequence"]})
 

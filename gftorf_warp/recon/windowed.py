@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 from collections.abc import Callable
@@ -95,6 +96,8 @@ def reconstruct_in_windows(
                     **chosen,
                 )
                 gaussians += run.gaussians
+                del run
+                gc.collect()  # a run and its sequence refer to each other: the next one needs room
             folder.write_config(out, config | _finished(out, count) | {"gaussians": gaussians})
     return Run.open(out, device)
 
