@@ -25,3 +25,6 @@ WINDOW_SIGMA = 1.5  # [px] standard deviation of that window
 # (0.01 L)^2 for a range L = 1: keeps the comparison of means defined in black regions
 STABILISE_MEAN = 1e-4
 STABILISE_SPREAD = 9e-4  # (0.03 L)^2, the same for the comparison of contrasts
+# where the distance of a pixel is from, by the values 0 to 3 of a map of sources: recon/fallback.py
+# and, for the last one, recon/outlines.py
+SOURCES = ("fit", "temporal", "closed_form", "outline")

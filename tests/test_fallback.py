@@ -10,13 +10,13 @@ import torch
 from moving_box import recording, seen
 from small_runs import demo
 
-from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
+from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SOURCES
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.data.temporal import agreement, averaged_locally
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
-from gftorf_warp.recon.fallback import SOURCES, Fallback
+from gftorf_warp.recon.fallback import Fallback
 from gftorf_warp.recon.residuals import residuals
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct

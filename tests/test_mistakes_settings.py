@@ -23,7 +23,7 @@ RECORDED = [
     presets.Recorded(input=kind, unambiguous_range=d)
     for kind, d in ((Input.QUADS, 7.5), (Input.PHASOR, 5.0))
 ]
-FITTED = [name for name in presets.PRESETS if name not in {"ctof", "temporal"}]
+FITTED = [name for name in presets.PRESETS if presets.preset(name).method.fits]
 
 
 @pytest.mark.parametrize("recorded", RECORDED, ids=["quads", "phasor"])

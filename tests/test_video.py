@@ -8,13 +8,13 @@ import OpenEXR
 import pytest
 from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with_colour
 
+from gftorf_warp.constants import SOURCES
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import pictures, video
 from gftorf_warp.evaluate.captioned import Panel, captioned
 from gftorf_warp.evaluate.previews import with_units
 from gftorf_warp.evaluate.views import render_to_folder, render_to_video
-from gftorf_warp.recon.fallback import SOURCES
 from gftorf_warp.recon.outlines import OUTLINE
 
 

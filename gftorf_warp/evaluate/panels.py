@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..constants import SPEED_OF_LIGHT
+from ..constants import SOURCES, SPEED_OF_LIGHT
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
 from ..data.unwrap import CONFIDENT
-from ..recon.fallback import SOURCES
 from ..recon.residuals import Residuals
 from . import controls, figures, page, pictures
 from .gallery import Colour, Novel

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..constants import SOURCES
 from ..data.exr import Attribute, write_exr
 from ..data.files import write_one_of_many
 from ..data.images import indexed_png_bytes, png_bytes
-from ..recon.fallback import SOURCES
 from . import pictures
 from .captioned import Panel, captioned
 

@@ -55,7 +55,7 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     """Images by channel name, as in an EXR file.
 
     distance: ``distance`` [m], not divided by ``opacity`` [1]; ``source``, if the run has one: an
-    index into ``recon.fallback.SOURCES``. distance_median: the same name [m], of the fit, 0 where
+    index into ``constants.SOURCES``. distance_median: the same name [m], of the fit, 0 where
     more than half of the light passes. quads: ``quad_<shift in degrees>``
     [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
     linear [1].

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from ..constants import SOURCES
 from ..data import resources, temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
-from ..recon.fallback import SOURCES
 from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
 from ..render.series import KEPT, View, on_host

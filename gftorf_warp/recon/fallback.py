@@ -42,8 +42,6 @@ from ..scene.sensor import quad_from_phasor
 from . import closed_form
 from .residuals import Residuals
 
-SOURCES = ("fit", "temporal", "closed_form", "outline")
-"""Names of the values 0 to 3 of a map of sources; for the last one see outlines.py."""
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
 TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
