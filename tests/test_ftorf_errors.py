@@ -88,6 +88,9 @@ def test_what_is_no_sequence_folder(tmp_path, kind):
 
 def test_one_level_off_names_the_sequence(folder):
     """Both above and inside a sequence, the fix is its path."""
+    above = folder.parent / "above"  # of which nothing else is read
+    above.mkdir()
+    folder = folder.rename(above / "seq")
     for path in (folder.parent, folder / "tofType1", folder / "cams"):
         assert_names(refused(path), path.name, "one level off", str(folder))
 

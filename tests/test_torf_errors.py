@@ -158,6 +158,9 @@ def test_what_is_missing_is_named(folder):
 
 def test_one_level_off_names_the_sequence(folder):
     """Both above and inside a folder, the fix is its path."""
+    above = folder.parent / "above"  # of which nothing else is read
+    above.mkdir()
+    folder = folder.rename(above / "seq")
     for path in (folder.parent, folder / "tof"):
         assert_names(refused(path), path.name, "one level off", str(folder))
 
