@@ -38,6 +38,7 @@ import numpy as np
 from accuracy_jobs import Job, Result, Row, Setup, Work, failure, picture_of
 
 import gftorf_warp
+from gftorf_warp.sweep.command import read_results
 from gftorf_warp.sweep.workers import Lost, Workers, places
 
 TUNING, VALIDATION = range(16), range(100, 116)
@@ -167,13 +168,6 @@ def _sets(options: argparse.Namespace) -> dict[str, list[str]]:
 def _natural(path: Path) -> tuple[str, int]:
     name, _, number = path.name.partition("-")
     return name, int(number) if number.isdigit() else -1
-
-
-def read_results(path: Path) -> dict[str, Result]:
-    """The last complete line of every id."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-    results = (json.loads(line) for line in lines if line.endswith("\n"))
-    return {result["id"]: result for result in results}
 
 
 def source_of_the_package() -> str:

@@ -520,10 +520,7 @@ class WindowedRun(WithoutGaussians):
         rendering = self.joined.rendered(
             time, lambda window, local: window.render(local, camera, f_mod_hz=f_mod_hz)
         )
-        if extra is None:
-            return rendering
-        size = rendering.distance.shape
-        return replace(rendering, extra=rendering.distance.new_zeros(extra.shape[1], *size))
+        return _with_empty_extra(rendering, extra)
 
     def renderer(
         self,
@@ -599,10 +596,15 @@ class VolumeRun(WithoutGaussians):
             quad_scale=self.quad_scale,
             colour_scale=self.colour_scale,
         )
-        if extra is None:
-            return found
-        none = torch.zeros(extra.shape[1], camera.height, camera.width, device=self.volume.device)
-        return replace(found, extra=none)
+        return _with_empty_extra(found, extra)
+
+
+def _with_empty_extra(rendering: Rendering, extra: Float[Tensor, "0 D"] | None) -> Rendering:
+    """A rendering without Gaussians, whose extra channels are zero if they are wanted."""
+    if extra is None:
+        return rendering
+    size = rendering.distance.shape
+    return replace(rendering, extra=rendering.distance.new_zeros(extra.shape[1], *size))
 
 
 def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:

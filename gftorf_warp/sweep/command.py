@@ -63,13 +63,13 @@ def sweep(
     out = Path(out).resolve()
     out.mkdir(parents=True, exist_ok=True)
     with locked(out, ".sweep.lock", "sweep"), _doers(plan, devices, workers, scheduler) as doers:
-        results = _stored(out / STORE)
+        results = read_results(out / STORE)
         done, total = 0, len(plan.recordings) + len(plan.fits)
         for jobs in (plan.recordings, plan.fits):
             tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
             for task, outcome in doers.outcomes(tasks):
                 result = _result(task, outcome)
-                if "metrics" in result or "error" in result or task.job.row is None:
+                if "error" in result or result["key"] != _key(results, task.job):
                     _store(out / STORE, result)
                     results[task.job.id] = result
                 done += 1
@@ -107,8 +107,8 @@ def _key(results: dict[str, Result], job: Job) -> str | None:
     return None if "error" in stored else stored.get("key")
 
 
-def _stored(path: Path) -> dict[str, Result]:
-    """The last complete line of every job."""
+def read_results(path: Path) -> dict[str, Result]:
+    """The last complete line of every job; none without the file."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
     return {r["id"]: r for r in (json.loads(line) for line in lines if line.endswith("\n"))}
 
