@@ -55,7 +55,7 @@ TABLE = {
         TORCH | {"viser"},
     ),
     "sweep": (
-        {"data", "evaluate", "process", "recon", "render", "sim", "terminal"},
+        {"data", "evaluate", "process", "recon", "render", "scene", "sim", "terminal"},
         TORCH | {"cv2", "distributed"},
     ),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),

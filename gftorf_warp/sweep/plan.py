@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
@@ -12,6 +11,7 @@ from typing import Any
 from ..data.texts import read_toml
 from ..errors import InputError
 from ..recon import presets
+from ..scene.changes import suggestion
 from ..sim.scenes import SCENES
 from ..sim.settings import SimSettings
 
@@ -163,9 +163,8 @@ def _check_keys(found: Iterable[str], known: Iterable[str], path: Path, where: s
     known = list(known)
     for key in found:
         if key not in known:
-            near = difflib.get_close_matches(key, known, 1)
-            hint = f", did you mean {near[0]}?" if near else f": there are {', '.join(known)}"
-            raise _wrong(path, where + key, f"there is no such key{hint}")
+            hint = suggestion(key, known) or f"there are {', '.join(known)}"
+            raise _wrong(path, where + key, f"there is no such key: {hint}")
 
 
 def _wrong(path: Path, key: str, why: str) -> InputError:
@@ -185,9 +184,8 @@ def _scene(word: str, path: Path) -> Scene:
         return Scene(name=word)
     folder = path.parent / word
     if not folder.is_dir():
-        near = difflib.get_close_matches(word, [*SCENES, "random-0"], 1)
-        hint = f", did you mean {near[0]}?" if near else ""
-        raise _wrong(path, "scenes", f"{word!r} is neither a scene nor a folder{hint}")
+        hint = suggestion(word, [*SCENES, "random-0"])
+        raise _wrong(path, "scenes", f"{word!r} is neither a scene nor a folder. {hint}".rstrip())
     name = folder.resolve().name
     return Scene(name=name if NAME.fullmatch(name) else "sequence", sequence=folder.resolve())
 
