@@ -16,9 +16,10 @@ all its intervals alike.
 Results are lines in DIR/results.jsonl, one per scene and per fit. What is there with the same
 settings and data is not repeated, so the same command continues after an interruption or --limit,
 and --again repeats fits of other versions of the package, which tables otherwise mix and name. Fits
-run in K processes: four on CUDA, on a CPU one per core; seconds are those of K fits at once. A fit
-that fails is a row with its error. Prints two tables per set of scenes, also written to
-DIR/table.md, and writes DIR/worst.png: truth, closed form, d and its error of the worst fits.
+run in K processes: four on CUDA, shared among all GPUs, on a CPU one per core; seconds are those of
+K fits at once. A fit that fails is a row with its error. Prints two tables per set of scenes, also
+written to DIR/table.md, and writes DIR/worst.png: truth, closed form, d and its error of the worst
+fits.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from pathlib import Path
 import accuracy_table as table
 import cv2
 import numpy as np
+import torch
 from accuracy_jobs import Job, Result, Row, Setup, Work, failure, picture_of
 
 import gftorf_warp
@@ -78,7 +80,9 @@ def main(arguments: list[str] | None = None) -> int:
         for row in options.rows
     ]
     left = 0
-    with Workers(places([options.device], options.workers), Work(setup)) as workers:
+    gpus = [f"cuda:{k}" for k in range(torch.cuda.device_count())]
+    devices = gpus if options.device == "cuda" else [options.device]
+    with Workers(places(devices, options.workers), Work(setup)) as workers:
         for jobs in (scenes, fits):
             done = 0
             tasks = [(job, known.get(job.id(setup))) for job in jobs]

@@ -210,7 +210,7 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
     folder = setup.out / "runs" / job.id(setup).replace("/", "_")
     shutil.rmtree(folder, ignore_errors=True)
     if kind == "cuda":
-        torch.cuda.reset_peak_memory_stats()
+        torch.cuda.reset_peak_memory_stats(setup.device)
     run = reconstruct(sequence, folder, settings, seed=job.seed, device=setup.device)
     scores = compare(run, report=False)
     _draw(job, setup, run, sequence, scores)
@@ -221,7 +221,9 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
         "seconds": run.config["seconds_reconstruct"],
         "gaussians": run.gaussians,
         "rise": _rise(folder),
-        "memory_mib": torch.cuda.max_memory_allocated() / 2**20 if kind == "cuda" else None,
+        "memory_mib": torch.cuda.max_memory_allocated(setup.device) / 2**20
+        if kind == "cuda"
+        else None,
     }
     if not setup.keep:
         shutil.rmtree(folder, ignore_errors=True)
@@ -306,8 +308,9 @@ class Work:
         cv2.setNumThreads(max(len(place.cpus), 1))
         wp.config.log_level = wp.LOG_ERROR
         job, known = task
+        setup = replace(self.setup, device=place.device)
         try:
-            return result_of(job, self.setup, known)
+            return result_of(job, setup, known)
         except GftorfError as error:
             why = " ".join(f"{type(error).__name__}: {error}".split())
         except Exception as error:  # a job never ends the benchmark
