@@ -16,7 +16,8 @@ from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
 from gftorf_warp.recon.closed_form import nearest_quartet, quads_of
-from gftorf_warp.recon.run import ClosedForm, Run
+from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.runs.closed_form import ClosedForm
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.sensor import distance_from_phasor, phasor_from_quads
 

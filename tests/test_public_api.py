@@ -72,7 +72,10 @@ def lines_of_class(name, kind):
             default = field.default if not missing else default or inspect.Parameter.empty
             yield f"{name}.{annotated(field.name, field.type, default)}"
     written = not dataclasses.is_dataclass(kind)  # those of dataclasses repeat their fields
-    for member, value in vars(kind).items():
+    members = {}
+    for one in kind.__mro__[::-1] if dataclasses.is_dataclass(kind) else [kind]:  # inherited, too
+        members |= vars(one) if one.__module__.startswith("gftorf_warp.") else {}
+    for member, value in members.items():
         if member.startswith("_") and not (member == "__init__" and written):
             continue
         if isinstance(value, classmethod | staticmethod):

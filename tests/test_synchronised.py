@@ -18,7 +18,8 @@ from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon.observations import data_hash
-from gftorf_warp.recon.run import Flow2D, Run
+from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.runs.closed_form import Flow2D
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES

@@ -16,7 +16,8 @@ from gftorf_warp.data.truth import static_throughout
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.recon.run import Run, Temporal
+from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.runs.closed_form import Temporal
 from gftorf_warp.recon.train import reconstruct
 
 NOISE = 2e-3

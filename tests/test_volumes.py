@@ -18,7 +18,8 @@ from gftorf_warp.export.command import export
 from gftorf_warp.recon import checkpoint, presets
 from gftorf_warp.recon.observations import observe, reduced
 from gftorf_warp.recon.record import Metrics
-from gftorf_warp.recon.run import Run, VolumeRun
+from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.runs.volume import VolumeRun
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.recon.volume.loop import VolumeLoop, begin, from_dict
 from gftorf_warp.recon.volume.models import VOLUMES, new_volume

@@ -22,7 +22,6 @@ from ..data.temporal import camera_rests
 from ..errors import InputError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
-from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.sensor import channel_of, quad_from_phasor
 
 POSE_TOLERANCE = 1e-6  # [m], [1] poses are stored as float32 at worst
@@ -121,19 +120,6 @@ def checked(sequence: Sequence) -> Sequence:
             fix="check the sequence with `gftorf check`, or record longer",
         )
     return sequence
-
-
-def no_gaussians(device: torch.device | str) -> GaussianField:
-    """A field of N = 0 Gaussians."""
-    none = torch.zeros(0, device=device)
-    triple = none.reshape(0, 3)
-    return GaussianField(
-        mean=triple,
-        log_scale=triple,
-        quaternion=none.reshape(0, 4),
-        opacity_logit=none,
-        reflectivity_sh=constant_sh(none),
-    )
 
 
 def nearest_quartet(sequence: Sequence, time: float) -> int:

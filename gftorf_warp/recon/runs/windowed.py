@@ -1,0 +1,111 @@
+"""Runs of long recordings, whose windows are runs of their own."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...render.api import Rendering
+from ...render.inputs import DIFFERENTIABLE
+from ...scene.camera import Camera
+from ...scene.gaussians import GaussianField
+from .. import source
+from ..joined import Joined, Window, folder_of, refused
+from ..read_back import ReadBack
+from ..settings import Method
+from .base import Run
+from .empty import WithoutGaussians, with_empty_extra
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WindowedRun(WithoutGaussians):
+    """A run of a long recording, whose windows are runs of their own, see joined.py.
+
+    Times are those of the recording. Two windows are in memory at a time.
+    """
+
+    joined: Joined[Run]
+    """Its windows."""
+
+    @classmethod
+    def _opened(cls, path: Path, found: ReadBack, device: torch.device | str) -> Self:
+        config = found.config
+        source.check_windows(path, config)
+
+        def opened(number: int) -> Run:
+            gc.collect()  # a window that was closed may still refer to itself
+            window = Run.open(folder_of(path, number), device)
+            return replace(window, config=window.config | {"sequence": config["sequence"]})
+
+        windows = [Window.of(stored) for stored in config["windows"]]
+        return cls._empty(path, found, device, joined=Joined(windows, opened))
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians of all windows."""
+        return int(self.config["gaussians"])
+
+    @property
+    def has_colour(self) -> bool:
+        """Whether colour can be rendered."""
+        return self.config.get("colour_scale") is not None
+
+    def render(
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "0 D"] | None = None,
+        f_mod_hz: float | None = None,
+    ) -> Rendering:
+        """What the sensor would see at one instant; as :meth:`Run.render`, extra channels are 0."""
+        fits = Method(self.config["settings"].get("method", Method.GAUSSIANS)).fits
+        if fits:
+            camera = camera or self.camera
+        rendering = self.joined.rendered(
+            time, lambda window, local: window.render(local, camera, f_mod_hz=f_mod_hz)
+        )
+        return with_empty_extra(rendering, extra)
+
+    def renderer(
+        self,
+        images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
+        *,
+        f_mod_hz: float | None = None,
+        corrected: bool = True,
+    ) -> Callable[[float, Camera], Rendering]:
+        """As :meth:`Run.renderer`."""
+        names = tuple(images)
+        renderers: Joined[Callable[[float, Camera], Rendering]] = self.joined.mapped(
+            lambda window: window.renderer(names, f_mod_hz=f_mod_hz, corrected=corrected)
+        )
+        return lambda time, camera: renderers.rendered(
+            time, lambda render, local: render(local, camera)
+        )
+
+    def corrected(
+        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
+    ) -> Rendering:
+        """As :meth:`Run.corrected`, by the windows of the time."""
+        return self.joined.rendered(
+            time, lambda window, local: window.corrected(rendering, local, camera, f_mod_hz)
+        )
+
+    def edited(self, field: GaussianField, rows: Int[Tensor, "N"] | None = None) -> Run:  # noqa: ARG002
+        """Refused.
+
+        Raises:
+            UsageError: Always: each window has Gaussians of its own.
+        """
+        raise refused(self.path)
+
+    def save(self, out: str | Path) -> Run:  # noqa: ARG002
+        """Refused, as :meth:`edited`."""
+        raise refused(self.path)
