@@ -252,7 +252,7 @@ def python() -> str:
     for name, thing in objects.items():
         kind = "autoclass" if inspect.isclass(thing) else "autofunction"
         text += f"{name}\n{'-' * len(name)}\n\n.. {kind}:: gftorf_warp.{name}\n"
-        text += "   :members:\n\n" if kind == "autoclass" else "\n"
+        text += "   :members:\n   :inherited-members:\n\n" if kind == "autoclass" else "\n"
     for name in MODULES:
         module = f"gftorf_warp.{name}"
         shown_above = ", ".join(n for n, o in objects.items() if o.__module__ == module)
