@@ -6,7 +6,8 @@ Each command runs in a process of its own, on the CPU at tiny size, and is kille
 time up to its usual one; the same command then goes on, until all were killed so often. After every
 kill, the newest checkpoint of a run must load. In the end nothing but the clock may differ from the
 undisturbed result, and no temporary file may be left. Prints a row per command; the exit code is 1
-if anything failed. Commands: simulate, reconstruct, render, export.
+if anything failed. Commands: simulate, import, reconstruct, render, export, compare, sweep; half of
+the kills also end the processes that a command started.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ import torch
 # imported before processes are forked, so that each starts at once
 from gftorf_warp.cli import main
 from gftorf_warp.evaluate import compare, views  # noqa: F401
+from gftorf_warp.export import command as export_command  # noqa: F401
+from gftorf_warp.importers import command as import_command  # noqa: F401
 from gftorf_warp.recon import checkpoint, train  # noqa: F401
 from gftorf_warp.sim import simulate  # noqa: F401
 
@@ -37,8 +40,18 @@ SIZE = ["--size", "32x24", "--frames", "12"]
 RECONSTRUCT = "--preset demo --images 96 --set schedule.log_every=8".split()
 OFTEN = ["--set", "schedule.checkpoint_every_s=0"]  # changes no result
 DEVICE = ["--device", "cpu"]
-CLOCKS = ("seconds", "seconds_reconstruct")
-LOGS = (".lock", "run.log", "config.json")  # clocks, paths and settings that change no result
+FORMATS = ("ply", "exr", "npz", "tum", "html", "gif")
+PLAN = """
+scenes = ["random-1", "random-2"]
+presets = ["demo", "ctof"]
+images = 96
+[simulate]
+size = [32, 24]
+frames = 12
+"""
+CLOCKS = ("seconds", "seconds_reconstruct", "wall_s", "total_s", "images_per_s")
+LOGS = (".lock", ".sweep.lock", "run.log")  # clocks and processes
+TEXTS = (".json", ".jsonl", ".html")
 
 
 @dataclass(frozen=True)
@@ -52,63 +65,99 @@ class Killed:
 
 
 def run_of(place: Path) -> dict[str, Any]:
-    """State and rows of a run, without clocks."""
+    """State, rows and config of a run, without clocks."""
     stored = checkpoint.last(place)
     assert stored is not None, "a finished run has a checkpoint"
     rows = {
-        name: [
-            {key: value for key, value in json.loads(line).items() if key not in CLOCKS}
-            for line in (place / name).read_text().splitlines()
-        ]
+        name: [timeless(json.loads(line), place) for line in (place / name).open()]
         for name in ("metrics.jsonl", "diagnostics.jsonl")
     }
-    return {key: value for key, value in stored.items() if key not in CLOCKS} | rows
+    config = timeless(json.loads((place / "config.json").read_text()), place)
+    return timeless(stored, place) | rows | {"config": config}
+
+
+def timeless(value: Any, place: Path) -> Any:
+    """A nested value without clocks and without the folder that it was written to."""
+    if isinstance(value, dict):
+        kept = {key: one for key, one in value.items() if key not in CLOCKS}
+        return {key: timeless(one, place) for key, one in kept.items()}
+    if isinstance(value, (list, tuple)):
+        return [timeless(one, place) for one in value]
+    return value.replace(str(place), "OUT") if isinstance(value, str) else value
 
 
 def files_of(place: Path) -> dict[str, bytes]:
-    """Bytes of all files by relative name."""
-    return {
+    """Bytes of all files by relative name; in texts without the name of the folder."""
+    contents = {
         str(path.relative_to(place)): path.read_bytes()
         for path in sorted(place.rglob("*"))
         if path.is_file() and path.name not in LOGS
     }
+    named = str(place).encode()
+    return {
+        name: data.replace(named, b"OUT") if name.endswith(TEXTS) else data
+        for name, data in contents.items()
+    }
 
 
-def same(a: Any, b: Any) -> bool:
-    """Whether nested values agree to the bit."""
-    if isinstance(a, torch.Tensor):
-        return a.shape == b.shape and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return bool(a == b)
+def report_of(run: Path) -> Any:
+    """What ``compare`` says of a run."""
+    return timeless(json.loads((run / "metrics.json").read_text()), run)
+
+
+def sweep_of(place: Path) -> Any:
+    """Scenes, pictures and runs of a sweep, and its results without clocks."""
+    results = timeless(json.loads((place / "sweep.json").read_text()), place)
+    folders = [path.parent for path in sorted(place.glob("runs/*/*/ckpt"))]
+    runs = {str(run.relative_to(place)): timeless(run_of(run), place) for run in folders}
+    assert runs, "a sweep has runs"
+    return [results, runs, files_of(place / "scenes"), files_of(place / "pictures")]
+
+
+def differences(a: Any, b: Any, where: str = "") -> list[str]:
+    """Where nested values differ."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        pairs = [(f"{where}/{key}", a.get(key), b.get(key)) for key in sorted({*a, *b}, key=str)]
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        pairs = [(f"{where}/{n}", x, y) for n, (x, y) in enumerate(zip(a, b, strict=True))]
+    else:
+        if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+            return [] if a.shape == b.shape and torch.equal(a, b) else [where]
+        return [] if type(a) is type(b) and a == b else [where]
+    return [found for name, x, y in pairs for found in differences(x, y, name)]
 
 
 def commands(made: Path) -> dict[str, Killed]:
     """What is killed, by name; ``made`` holds a sequence and a run of it."""
-    run, sequence = str(made / "run"), str(made / "seq")
-    fitted, again = [*RECONSTRUCT, *OFTEN, *DEVICE], ["--fresh", *DEVICE]
-    return {
-        "simulate": Killed(lambda out: ["simulate", "demo", *SIZE, "--out", str(out)], files_of),
-        "reconstruct": Killed(
-            lambda out: ["reconstruct", sequence, "--out", str(out), *fitted], run_of
-        ),
-        "render": Killed(
-            lambda out: ["render", run, "--what", "distance,quads", "--out", str(out), *DEVICE],
-            files_of,
-        ),
-        "export": Killed(
-            lambda out: ["export", run, "--format", "ply,exr", "--out", str(out), *again],
-            lambda out: [files_of(out / name) for name in ("ply", "exr")],
-        ),
+    run, sequence, plan = str(made / "run"), str(made / "seq"), made / "plan.toml"
+    plan.write_text(PLAN)
+    fitted = [*RECONSTRUCT, *OFTEN, *DEVICE]
+
+    def compared(out: Path) -> list[str]:
+        if not out.exists():
+            shutil.copytree(run, out)
+        return ["compare", str(out), *DEVICE]
+
+    words: dict[str, tuple[list[str], Callable[[Path], Any]]] = {
+        "simulate": (["simulate", "demo", *SIZE], files_of),
+        "import": (["import", "ftorf", sequence], files_of),
+        "reconstruct": (["reconstruct", sequence, *fitted], run_of),
+        "render": (["render", run, "--what", "distance,quads", *DEVICE], files_of),
+        "export": (["export", run, "--format", ",".join(FORMATS), *DEVICE], files_of),
+        "sweep": (["sweep", str(plan), *DEVICE, "--workers", "1"], sweep_of),
     }
+    known = {
+        name: Killed(lambda out, given=given: [*given, "--out", str(out)], content)
+        for name, (given, content) in words.items()
+    }
+    return known | {"compare": Killed(compared, report_of)}
 
 
 def started(words: list[str]) -> int:
     """Process id of a command that runs without output."""
     child = os.fork()
     if child:
+        os.setpgid(child, child)
         return child
     code = 1
     try:
@@ -133,15 +182,15 @@ def finished(words: list[str]) -> float:
     return time.monotonic() - begun
 
 
-def killed(words: list[str], after: float) -> bool:
-    """Kill a command after some seconds; whether it was still running."""
+def killed(words: list[str], after: float, *, alone: bool) -> bool:
+    """Kill a command after some seconds, ``alone`` or with its processes; whether it still ran."""
     child = started(words)
     deadline = time.monotonic() + after
     while time.monotonic() < deadline:
         if os.waitpid(child, os.WNOHANG)[0]:
             return False
         time.sleep(0.002)
-    os.kill(child, signal.SIGKILL)
+    (os.kill if alone else os.killpg)(child, signal.SIGKILL)
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
@@ -154,13 +203,17 @@ def trial(name: str, one: Killed, place: Path, kills: int, chosen: random.Random
         shutil.rmtree(out, ignore_errors=True)
         goal = min(kills, count + chosen.randrange(1, 5))
         while count < goal:
-            if not killed(one.words(out), chosen.uniform(0.0, usual)):
+            after, alone = chosen.uniform(0.0, usual), chosen.random() < 0.5
+            if not killed(one.words(out), after, alone=alone):
                 break  # it was finished before
             count += 1
             unreadable += name == "reconstruct" and not _loads(out)
         finished(one.words(out))
         completions += 1
-        differing += not same(one.content(out), want)
+        apart = differences(one.content(out), want)
+        differing += bool(apart)
+        if apart:
+            print(f"{name} differs in {apart[:8]}", file=sys.stderr)
     strays = [path for path in place.rglob("*") if ".tmp-" in path.name or ".partial" in path.name]
     row = {"command": name, "kills": count, "completed": completions, "unreadable": unreadable}
     return row | {"differing": differing, "strays": len(strays), "usual_s": round(usual, 2)}
@@ -178,7 +231,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=100, help="of each command")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--commands", default="simulate,reconstruct,render,export")
+    parser.add_argument("--commands", default="simulate,import,reconstruct,render,export,compare")
     return parser.parse_args()
 
 

@@ -1,6 +1,8 @@
 """What ``gftorf export`` writes, read back by other libraries."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,7 @@ from gftorf_warp.constants import FRAME_RATE_HZ
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import UsageError
 from gftorf_warp.export.command import FORMATS, export
+from gftorf_warp.export.listed import LIST
 from gftorf_warp.options import command_parsers
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
@@ -153,6 +156,52 @@ def test_nothing_is_overwritten_or_left_half_written(run, tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         export(run, tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_the_same_export_finishes_after_a_kill(run, tmp_path, monkeypatch):
+    """What was complete stays; strays of a process that is gone are removed."""
+    out, formats = tmp_path / "out", "exr,tum,ply"
+    with monkeypatch.context() as patch:
+        patch.setitem(FORMATS, "ply", FORMATS["ply"]._replace(write=interrupted))
+        with pytest.raises(KeyboardInterrupt):
+            export(run, out, formats)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != LIST}
+    assert {path.name for path in before} >= {"poses.txt", "frame_0000.exr"}
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (out / f".ply.tmp-{gone.pid}-0").mkdir()
+    (out / f".{LIST}.tmp-{gone.pid}-1").write_text("{")
+    targets = export(run, out, formats)
+    assert [path.name for path in targets] == ["exr", "poses.txt", "ply"]
+    assert len(list((out / "ply").iterdir())) == FRAMES
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+    assert not list(out.glob(".*"))
+    assert export(run, out, formats) == targets
+
+
+def interrupted(*_, **__):
+    """A writer that is stopped."""
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("spoil", ["field", "seed", "colour", "list"])
+def test_another_export_is_not_taken_for_the_same(run, tmp_path, spoil):
+    """Edited Gaussians, another state of the folder, another colour, a damaged list."""
+    out, given = tmp_path / "out", {}
+    (folder,) = export(run, out, times=[0.0])
+    if spoil == "field":
+        run = run.edited(run.field.map(lambda tensor: tensor.clone()))
+        run.field.opacity_logit[0] -= 1.0
+    elif spoil == "seed":
+        run.config["seed"] = 7
+    elif spoil == "colour":
+        given = {"colour": "reflectivity"}
+    else:
+        (out / LIST).write_text("{")
+    before = (folder / "frame_0000.ply").read_bytes()
+    with pytest.raises(UsageError, match="--fresh"):
+        export(run, out, times=[0.0], **given)
+    assert (folder / "frame_0000.ply").read_bytes() == before
 
 
 @pytest.mark.parametrize(

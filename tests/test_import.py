@@ -1,5 +1,8 @@
 """``gftorf import``: kinds, keys of TOML files, and folders of the TöRF family as captures."""
 
+import shutil
+import subprocess
+import sys
 import tomllib
 
 import numpy as np
@@ -233,6 +236,24 @@ def test_a_folder_in_use_is_refused_before_anything_is_read(folders, tmp_path, m
     monkeypatch.setitem(KINDS, "ftorf", None)  # reading would fail
     with pytest.raises(UsageError, match="not empty"):
         import_recording("ftorf", folders / "ftorf", tmp_path / "seq")
+
+
+def test_a_finished_import_may_be_repeated(folders, tmp_path):
+    """Of a command that was killed after its last step; what another would write is refused."""
+    out, source = tmp_path / "seq", tmp_path / "source"
+    shutil.copytree(folders / "ftorf", source)
+    lines = import_recording("ftorf", source, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / f".seq.tmp-{gone.pid}-0").mkdir()  # of one that was killed while it compared
+    assert import_recording("ftorf", source, out) == lines
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seq", "source"]
+    shutil.copy(source / "synthetic_depth" / "0007.npy", source / "synthetic_depth" / "0001.npy")
+    with pytest.raises(UsageError, match="another import"):
+        import_recording("ftorf", source, out)
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*")}
 
 
 def test_a_reader_in_memory(folders):

@@ -17,7 +17,7 @@ from moving_box import recording
 from small_runs import advance, demo, rows, same, small, stored
 
 from gftorf_warp.errors import BusyError, DivergedError, InputError, Terminated, UsageError
-from gftorf_warp.recon import checkpoint, folder, loop, presets
+from gftorf_warp.recon import checkpoint, folder, loop, presets, residuals
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, DensifySettings, Weights, plain
@@ -123,6 +123,24 @@ def test_a_run_that_was_killed_at_its_start_has_every_row_once(tmp_path, monkeyp
     )
     assert again == whole
     assert not [*(tmp_path / "run").glob(".*.tmp-*")]
+
+
+def test_a_run_that_was_killed_after_its_last_image_is_completed(tmp_path, monkeypatch):
+    """Its config says in the end what that of an undisturbed one says."""
+    settings = demo(images=8)
+    whole = reconstruct(small(), tmp_path / "whole", settings).config
+
+    def killed(*_):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(residuals, "residuals", killed)
+        with pytest.raises(SystemExit):
+            reconstruct(small(), tmp_path / "run", settings)
+    done = reconstruct(small(), tmp_path / "run", settings).config
+    assert done["explained"]["reduced_chi_square"] > 0
+    clocks = {name: done[name] for name in ("seconds_reconstruct",)}
+    assert done == whole | clocks
 
 
 def test_a_folder_resumes_or_says_why_not(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -12,11 +13,13 @@ import torch
 from moving_box import recording
 
 from gftorf_warp.cli import main
+from gftorf_warp.data.lock import locked
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, ResourceError
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
 from gftorf_warp.sweep.command import sweep
+from gftorf_warp.sweep.job import Task, do
 from gftorf_warp.sweep.plan import Plan, Row, Scene, read_plan
 from gftorf_warp.sweep.workers import Lost, Place, Workers, places
 
@@ -75,6 +78,26 @@ def test_what_is_done_is_not_done_again(swept):
     last = json.loads(lines[-1])["id"]
     assert again[last]["metrics"] == results[last]["metrics"]
     assert all(json.loads(line) for line in store.read_text().splitlines())
+
+
+def test_a_scene_that_a_lost_process_still_records_is_waited_for(swept, tmp_path):
+    """Its parent was killed, and the sweep repeated: it ends, or its lock does."""
+    plan = read_plan(swept[0] / "plan.toml")
+    partial = tmp_path / "out" / "scenes" / "demo.partial"
+    held = threading.Event()
+
+    def hold():
+        with locked(partial, ".lock", "sequence"):
+            held.set()
+            time.sleep(0.3)
+
+    other = threading.Thread(target=hold)
+    other.start()
+    held.wait()
+    result = do(Task(job=plan.recordings[0], plan=plan, out=tmp_path / "out"), Place("cpu"))
+    other.join()
+    assert "error" not in result, result
+    assert (tmp_path / "out" / "scenes" / "demo").is_dir()
 
 
 def test_the_table_has_means_spreads_and_what_others_published(swept):

@@ -3,10 +3,12 @@ and are never read as sequences.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,6 +119,35 @@ def test_a_damaged_file_is_made_again(tmp_path):
     files[3].write_bytes(bytes(data))
     simulate("demo", tmp_path / "seq", **OPTIONS)
     assert contents(tmp_path / "seq") == contents(whole)
+
+
+def test_a_kill_while_the_settings_are_written_is_no_other_recording(tmp_path):
+    """A temporary file, and nothing else, is there."""
+    partial = partial_of(tmp_path / "seq")
+    partial.mkdir()
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (partial / ".lock").touch()
+    (partial / f".unfinished.md.tmp-{gone.pid}-0").write_text("# de")
+    simulate("demo", tmp_path / "seq", **OPTIONS)
+    assert [path.name for path in tmp_path.iterdir()] == ["seq"]
+
+
+def test_a_kill_while_finished_images_are_removed_is_no_other_recording(tmp_path, monkeypatch):
+    """Whatever is removed first of the folder."""
+
+    def killed(folder, **_):
+        (Path(folder) / "unfinished.md").unlink(missing_ok=True)
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", killed)
+        with pytest.raises(SystemExit):
+            simulate("demo", tmp_path / "seq", **OPTIONS)
+    before = contents(tmp_path / "seq")
+    simulate("demo", tmp_path / "seq", **OPTIONS)
+    assert contents(tmp_path / "seq") == before
+    assert [path.name for path in tmp_path.iterdir()] == ["seq"]
 
 
 def test_two_processes_do_not_record_the_same(tmp_path):

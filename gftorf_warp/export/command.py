@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
-from ..recon.folder import set_aside
 from ..recon.joined import refused
 from ..recon.run import Run
-from . import cameras, film, images, mesh, points, scene_page, splats
+from . import cameras, film, images, listed, mesh, points, scene_page, splats
 from .moments import Moments, Progress
 
 COLOURS = ("colour", "reflectivity")
@@ -59,10 +58,12 @@ def export(
 ) -> list[Path]:
     """Write a finished run in the formats of other programs, see docs/export.md.
 
+    The same call writes what is missing: formats that it has finished are left as they are.
+
     Args:
         run: A finished reconstruction whose sequence can be read.
         out: Folder, made if absent. Each format has a folder or file of its own in it, which
-            appears when it is complete.
+            appears when it is complete, and ``export.json`` says what each was made of.
         formats: Names out of ``FORMATS``, or one text, separated by commas.
         times: Seconds since raw frame 0; None: all instants of the sequence.
         every: Every n-th instant of the sequence.
@@ -75,7 +76,8 @@ def export(
         The folder or file of each format.
 
     Raises:
-        UsageError: If a format or colour is unknown, the run lacks it, or its files exist.
+        UsageError: If a format or colour is unknown, the run lacks it, or files exist that were
+            made of something else.
         InputError: If the sequence cannot be read.
         ResourceError: If the disk is full.
     """
@@ -85,21 +87,26 @@ def export(
         raise UsageError(f"unknown colour {colour!r}", where="--colour", why=why, fix=why)
     moments = Moments.of(run, times, every)
     shown = colour or COLOURS[0 if moments.run.has_colour else 1]
-    targets = [out / FORMATS[name].target for name in names]
     check_content(moments, names, shown)
-    check_targets(targets, fresh=fresh)
-    for name, target in zip(names, targets, strict=True):
-        kind = FORMATS[name]
+    targets = {out / FORMATS[name].target: name for name in names}
+    asked = {
+        target: listed.asked_of(moments, shown if FORMATS[name].coloured else None)
+        for target, name in targets.items()
+    }
+    for target in listed.remaining(out, asked, fresh=fresh):
+        kind = FORMATS[targets[target]]
         write = functools.partial(kind.write, **{"colour": shown} if kind.coloured else {})
-        step = progress(name) if progress else lambda *_: None
+        step = progress(targets[target]) if progress else lambda *_: None
         if target.suffix:
             with as_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
+            listed.record(target, asked[target])
             write(moments, target, step)
         else:
             with atomic_folder(target) as folder:
                 write(moments, folder, step)
-    return targets
+                listed.record(target, asked[target])
+    return [*targets]
 
 
 def checked(formats: str | Iterable[str]) -> list[str]:
@@ -135,19 +142,3 @@ def check_content(moments: Moments, names: Iterable[str], colour: str) -> None:
     if colour == "colour" and not moments.run.has_colour:
         why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
         raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
-
-
-def check_targets(targets: Iterable[Path], *, fresh: bool) -> None:
-    """Move what an earlier export wrote aside if ``fresh``.
-
-    Raises:
-        UsageError: If there is such a thing and ``fresh`` is not set.
-    """
-    held = [target for target in targets if target.exists()]
-    if held and not fresh:
-        why = "an earlier export wrote it"
-        fix = "choose another --out, or --fresh, which moves it aside"
-        raise UsageError("nothing is overwritten", where=held[0], why=why, fix=fix)
-    if held:
-        with as_errors(held[0].parent):
-            set_aside(held[0].parent, held)

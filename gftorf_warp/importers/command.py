@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import difflib
 import logging
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
-from ..data.files import atomic_write, refuse_target
+from ..data.capture_json import MANIFEST
+from ..data.files import as_errors, atomic_write, refuse_target, sweep, temporary_name
 from ..data.sequence import Sequence
+from ..data.untrusted import read_text
 from ..data.write import write
 from ..data.writing import refuse_inexpressible
 from ..errors import InputError, UsageError
@@ -16,6 +20,7 @@ from .keys import load, template
 from .kinds import KINDS, Kind
 
 LOG = logging.getLogger("gftorf_warp")
+README = "README.md"  # what was understood, in the capture
 
 
 def kind_of(name: str) -> Kind:
@@ -77,6 +82,9 @@ def import_recording(
 ) -> list[str]:
     """Read a foreign recording and write it as a capture; without ``out`` write nothing.
 
+    A folder that an earlier import of this kind wrote is left as it is if this one would write the
+    same bytes, so that a command that was killed after its last step can be repeated.
+
     Returns:
         Lines for people: what was understood, and the folder. What is uncertain is logged as
         warnings.
@@ -85,7 +93,8 @@ def import_recording(
         UsageError, InputError: As :func:`read_recording`, or if the folder is not empty.
         ResourceError: If the disk is full.
     """
-    if out is not None:
+    again = out is not None and _is_import(Path(out), name)
+    if out is not None and not again:
         refuse_target(Path(out))  # before minutes of reading
     imported = read_recording(name, source, config)
     refuse_inexpressible("capture", imported.sequence, imported.truth)  # a dry run says so, too
@@ -94,9 +103,40 @@ def import_recording(
         LOG.warning("uncertain: %s", text)
     if out is None:
         return lines
-    readme = _readme(f"gftorf import {name}", lines, imported.uncertain)
-    write("capture", out, imported.sequence, imported.truth, readme=readme)
+    readme = _readme(name, lines, imported.uncertain)
+    given = imported.sequence, imported.truth
+    if again:
+        _refuse_different(Path(out), lambda path: write("capture", path, *given, readme=readme))
+    else:
+        write("capture", out, *given, readme=readme)
     return [*lines, str(out)]
+
+
+def _is_import(out: Path, name: str) -> bool:
+    """Whether a folder is what an import of this kind wrote, by the title of its README.md."""
+    readme = out / README
+    if not ((out / MANIFEST).is_file() and readme.is_file()):
+        return False
+    return read_text(readme).partition("\n")[0] == _title(name)
+
+
+def _refuse_different(out: Path, write: Callable[[Path], Path]) -> None:
+    """Raise a UsageError unless a folder holds what ``write`` would write.
+
+    It is written again beside it, and the sums of all files are compared.
+    """
+    sweep(out)  # of a process that was killed here
+    place = temporary_name(out.absolute())
+    try:
+        with as_errors(place):
+            place.mkdir()
+        copy = write(place / "capture")
+        same = all(read_text(out / n) == read_text(copy / n) for n in (MANIFEST, README))
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    if not same:
+        why, fix = "it holds another import", "choose another path, or remove the folder first"
+        raise UsageError("folder is not empty", where=out, why=why, fix=fix)
 
 
 def _summary(sequence: Sequence) -> str:
@@ -108,8 +148,13 @@ def _summary(sequence: Sequence) -> str:
     return f"{frames} over {sequence.times[-1]:.4g} s, {cycles}"
 
 
-def _readme(command: str, understood: list[str], uncertain: tuple[str, ...]) -> str:
+def _title(name: str) -> str:
+    """First line of README.md."""
+    return f"# Imported by `gftorf import {name}`"
+
+
+def _readme(name: str, understood: list[str], uncertain: tuple[str, ...]) -> str:
     """README.md of the capture."""
-    lines = [f"# Imported by `{command}`", "", *(f"* {line}" for line in understood)]
+    lines = [_title(name), "", *(f"* {line}" for line in understood)]
     lines += ["", "## Uncertain", "", *(f"* {line}" for line in uncertain)] if uncertain else []
     return "\n".join(lines) + "\n"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import enum
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -266,6 +266,9 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     if stored is not None and stored["images"] >= total:
         if sequence.path is not None:  # it may have moved
             source.remember(out, sequence.path)
+        known = folder.read_config(out)
+        if "explained" not in known:  # the process was killed after the last checkpoint
+            _conclude(sequence, out, known, stored, device)
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     if settings.method.is_volume:
@@ -293,12 +296,22 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         state: VolumeState | State = fit.fit(*given, **more)
     else:
         folder.write_config(out, config)
-        gaussians = _fit_gaussians(sequence, *given, **more)
-        config |= {name: getattr(gaussians, name) for name in ("skipped", "restarts", "revivals")}
-        state = gaussians
-    config |= {"seconds_reconstruct": state.seconds, "images_optimised": state.images}
-    folder.write_config(out, config)
+        state = _fit_gaussians(sequence, *given, **more)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+    _conclude(sequence, out, config, vars(state), device)
+
+
+def _conclude(
+    sequence: Sequence,
+    out: Path,
+    config: dict[str, Any],
+    state: Mapping[str, Any],
+    device: torch.device | str,
+) -> None:
+    """Write what config.json says of a finished run, by its state at the end."""
+    config |= {"seconds_reconstruct": state["seconds"], "images_optimised": state["images"]}
+    config |= {name: state[name] for name in ("skipped", "restarts", "revivals") if name in state}
+    folder.write_config(out, config)
     found = residuals.residuals(Run.open(out, device), sequence)
     residuals.warn(found)
     folder.write_config(out, config | {"explained": found and found.as_json()})

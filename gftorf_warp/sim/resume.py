@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.files import as_errors
+from ..data.files import as_errors, atomic_write
 from ..data.folder import UNFINISHED
 from ..data.lock import locked
 from ..errors import UsageError
@@ -50,7 +50,7 @@ def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
     text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
     if not fresh and text.startswith(card):
         # of a process that was killed just before it removed it
-        shutil.rmtree(partial_of(out), ignore_errors=True)
+        _remove(partial_of(out))
         return False
     if fresh and sequence:
         return True
@@ -99,13 +99,12 @@ def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
             if fresh:
                 for path in _images(folder):
                     path.unlink()
-            with as_errors(folder):
-                (folder / UNFINISHED).write_text(card, encoding="utf-8")
+            atomic_write(folder / UNFINISHED, card.encode())
             yield lambda name, make: _cached(folder / f"{name}.npz", make)
-        shutil.rmtree(folder)
+        _remove(folder)
     except BaseException:
         if not _images(folder) and not _is_held(folder):
-            shutil.rmtree(folder, ignore_errors=True)
+            _remove(folder)
             for parent in made:
                 with contextlib.suppress(OSError):
                     parent.rmdir()
@@ -113,7 +112,8 @@ def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
 
 
 def _refuse_other_partial(folder: Path, card: str, *, fresh: bool) -> None:
-    empty = folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
+    # the lock, and what a process left that was killed while it wrote the settings
+    empty = folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
     if empty or not folder.exists():
         return
     begun = folder / UNFINISHED
@@ -139,6 +139,13 @@ def _cached(path: Path, make: Callable[[], Images]) -> tuple[Images, bool]:
             np.savez(target, allow_pickle=False, **images)
         os.replace(temporary, path)
     return images, True
+
+
+def _remove(folder: Path) -> None:
+    """Remove the folder, its settings last: after a kill it is still that of this recording."""
+    for path in (*_images(folder), *folder.glob("*.tmp")):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _images(folder: Path) -> list[Path]:

@@ -7,6 +7,7 @@ import json
 import os
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from .plan import Job, Plan
 from .workers import Place
 
 Result = dict[str, Any]
-BUSY_S = 60.0  # [s] that a run may be busy: a lost worker's process may still be ending
+BUSY_S = 60.0  # [s] that a folder may be busy: a lost worker's process may still be ending
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +96,9 @@ def _begin(place: Place) -> None:
 
 def _simulated(task: Task, place: Place) -> Result:
     traced = task.plan.simulate.get("engine") == "mesh"
-    simulate(
-        task.job.scene.name,
-        sequence_of(task.job, task.out),
-        device=place.device if traced else "cpu",
-        **task.plan.simulate,
-    )
+    given = task.job.scene.name, sequence_of(task.job, task.out)
+    device = place.device if traced else "cpu"
+    _patiently(lambda: simulate(*given, device=device, **task.plan.simulate))
     return {"key": _hash(dict(task.plan.simulate))}
 
 
@@ -126,12 +124,12 @@ def _fitted(task: Task, place: Place) -> Result:
     return {"key": key, "metrics": metrics, **about, "memory_mib": memory and memory / 2**20}
 
 
-def _patiently(reconstruct: Any) -> Any:
-    """Wait a while for a run that another process works on."""
+def _patiently(work: Callable[[], Any]) -> Any:
+    """Wait a while for a recording or a run that another process works on."""
     end = time.monotonic() + BUSY_S
     while True:
         try:
-            return reconstruct()
+            return work()
         except BusyError:
             if time.monotonic() > end:
                 raise
