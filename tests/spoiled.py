@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 from damaged_files import damage
 
+from gftorf_warp.recon.folder import SUM
+
 VALUES = [None, True, -1, 0, 1e300, 10**30, "text", "", [], [1], {}, {"a": 1}]
 ANY_FILE = SimpleNamespace(damaged="**/*")
 
@@ -24,7 +26,7 @@ def spoil(run: Path, seed: int) -> str:
 
 def _in_config(path: Path, random: np.random.Generator) -> str:
     """Replace or remove one value, however deep."""
-    content = table = json.loads(path.read_text())
+    content = table = without_sum(json.loads(path.read_text()))
     where = [_key_of(table, random)]
     while isinstance(table[where[-1]], dict) and table[where[-1]] and random.random() < 0.8:
         table = table[where[-1]]
@@ -43,13 +45,18 @@ def _key_of(table: dict, random: np.random.Generator) -> str:
 
 
 def set_value(path: Path, name: str, value: object) -> None:
-    """Set a value of a JSON file; dots join the keys."""
-    content = table = json.loads(path.read_text())
+    """Set a value of a JSON file, as somebody who means it; dots join the keys."""
+    content = table = without_sum(json.loads(path.read_text()))
     *tables, key = name.split(".")
     for one in tables:
         table = table[one]
     table[key] = value
     path.write_text(json.dumps(content))
+
+
+def without_sum(config: dict) -> dict:
+    """The content of a config.json without the sum that would notice every change."""
+    return {name: value for name, value in config.items() if name != SUM}
 
 
 def copied(run: Path, to: Path) -> Path:

@@ -14,7 +14,7 @@ from moving_box import recording
 from gftorf_warp.cli import main
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.caveats import caveats
-from gftorf_warp.recon import checkpoint
+from gftorf_warp.recon import checkpoint, folder
 
 IMAGES, LATE = 40, 36
 
@@ -39,8 +39,7 @@ def place(made, tmp_path):
 
 def change_config(run: Path, **values):
     """Other values in config.json."""
-    path = run / "config.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+    folder.write_config(run, folder.read_config(run) | values)
 
 
 def cut(run: Path, images: int):
@@ -139,6 +138,30 @@ def test_a_report_of_a_later_state_is_not_replaced(place, capsys):
     for path, data in before.items():
         assert path.suffix == ".pt" or path.read_bytes() == data, path
     assert render(place, "--fresh") == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("a factor of all quads", '\n  "quad_scale": ', '\n  "quad_scale": 1'),
+        ("a digit of the camera", '"fx": ', '"fx": 1'),
+        ("a setting that a rendering reads", '"low_pass": 0.3', '"low_pass": 0.8'),
+        ("the sum itself", '"config_sha256": "', '"config_sha256": "f'),
+    ],
+)
+def test_a_changed_value_of_a_config_is_noticed(place, capsys, name, old, new):
+    """Although it is one that could be; older configs have no sum and are read as ever."""
+    path = place / "run" / "config.json"
+    text = path.read_text()
+    assert text.count(old) == 1, name
+    path.write_text(text.replace(old, new))
+    for command in (compare, render, reconstruct):
+        assert command(place, "-q") == 3
+        assert "SHA-256" in capsys.readouterr().err
+    change = json.loads(text)
+    del change["config_sha256"]
+    path.write_text(json.dumps(change, indent=4))
+    assert render(place, "-q") == 0
 
 
 def test_another_sequence_is_not_scored(place, capsys):

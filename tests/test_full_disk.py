@@ -18,7 +18,7 @@ from gftorf_warp.data.write import write
 from gftorf_warp.errors import GftorfError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
-from gftorf_warp.recon import checkpoint
+from gftorf_warp.recon import checkpoint, folder
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct as fit
 from gftorf_warp.terminal import as_known_error
@@ -138,14 +138,13 @@ def read_only(place):
 @pytest.fixture
 def shared(made):
     """A copy in a folder that everybody may enter, and one to write to."""
-    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
-        place = Path(folder)
+    with tempfile.TemporaryDirectory(dir="/tmp") as parent:
+        place = Path(parent)
         place.chmod(0o755)
         shutil.copytree(made, place / "made")
         run = place / "made" / "run"
-        config = json.loads((run / "config.json").read_text())
-        config["sequence"] = str(place / "made" / "seq")
-        (run / "config.json").write_text(json.dumps(config))
+        here = {"sequence": str(place / "made" / "seq")}
+        folder.write_config(run, folder.read_config(run) | here)
         (place / "mine").mkdir()
         (place / "mine").chmod(0o777)
         yield place

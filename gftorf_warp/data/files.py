@@ -16,6 +16,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -97,8 +98,12 @@ def write_json(path: str | Path, content: object) -> None:
     Raises:
         ValueError: If it contains NaN or infinity, which JSON cannot express: use None.
     """
-    text = json.dumps(content, indent=2, allow_nan=False, default=_plain)
-    atomic_write(path, f"{text}\n".encode())
+    atomic_write(path, f"{json_text(content, indent=2)}\n".encode())
+
+
+def json_text(content: object, **layout: Any) -> str:
+    """An object as JSON, as :func:`write_json` writes it, in a layout of ``json.dumps``."""
+    return json.dumps(content, allow_nan=False, default=_plain, **layout)
 
 
 @contextlib.contextmanager

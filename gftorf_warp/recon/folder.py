@@ -4,18 +4,21 @@ and whether a new call may go on there.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ..data import lock
-from ..data.files import sweep, write_json
+from ..data.files import json_text, sweep, write_json
 from ..data.texts import read_json
 from ..errors import InputError, UsageError
 from .settings import ReconSettings, plain
 
 CONFIG = "config.json"
+SUM = "config_sha256"  # the key in it with the SHA-256 of all others
 LOCK = ".lock"
 LOG = "run.log"  # a run that failed before its first step leaves this alone
 FRESH = (
@@ -112,10 +115,10 @@ def set_aside(run: Path, held: list[Path]) -> Path:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """Content of ``RUN/config.json``.
+    """Content of ``RUN/config.json`` without its sum, which older runs do not have.
 
     Raises:
-        InputError: If it is missing or no JSON object.
+        InputError: If it is missing or no JSON object, or its values are not those of its sum.
     """
     path = run / CONFIG
     fix = "name the --out folder of a reconstruction"
@@ -126,12 +129,25 @@ def read_config(run: Path) -> dict[str, Any]:
         raise InputError("not a run", where=path, why=why, fix=fix) from error
     if not isinstance(config, dict):
         raise InputError("not a run", where=path, why="expected a JSON object", fix=fix)
+    stated = config.pop(SUM, None)
+    if stated is not None and stated != (found := sum_of(config)):
+        why = (
+            f"the SHA-256 of its values is {found[:12]}..., {SUM} in it says {str(stated)[:12]}..."
+        )
+        fix = f"restore it from a copy; if a value was changed on purpose, remove {SUM} from it"
+        raise InputError("damaged config", where=path, why=why, fix=fix)
     return config
 
 
 def write_config(run: Path, config: dict[str, object]) -> None:
-    """Replace ``RUN/config.json``."""
-    write_json(run / CONFIG, config)
+    """Replace ``RUN/config.json``, with a sum by which a changed value is noticed."""
+    write_json(run / CONFIG, config | {SUM: sum_of(config)})
+
+
+def sum_of(config: dict[str, Any]) -> str:
+    """SHA-256 of the values of a config, however they are laid out in a file."""
+    text = json_text(json.loads(json_text(config)), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @contextmanager
