@@ -42,14 +42,15 @@ OFTEN = ["--set", "schedule.checkpoint_every_s=0"]  # changes no result
 DEVICE = ["--device", "cpu"]
 FORMATS = ("ply", "exr", "npz", "tum", "html", "gif")
 PLAN = """
-scenes = ["random-1", "random-2"]
+scenes = ["random-1"]
 presets = ["demo", "ctof"]
-images = 96
+images = 48
 [simulate]
 size = [32, 24]
-frames = 12
+frames = 8
 """
-CLOCKS = ("seconds", "seconds_reconstruct", "wall_s", "total_s", "images_per_s")
+# clocks, and sums of files that hold some
+CLOCKS = ("seconds", "seconds_reconstruct", "wall_s", "checkpoint_sha256", "config_sha256")
 LOGS = (".lock", ".sweep.lock", "run.log")  # clocks and processes
 TEXTS = (".json", ".jsonl", ".html")
 
