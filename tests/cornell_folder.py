@@ -61,8 +61,8 @@ def correlation(instant, f_mhz, image):
     return np.stack([r * values for r in REFLECTANCES], axis=2)
 
 
-def write(folder, instants=8):
-    """A folder of so many instants."""
+def write(folder, instants=8, distance=distance, correlation=correlation):
+    """A folder of so many instants, of this wall or of what these functions see."""
     folder.mkdir()
     for n in range(instants):
         depth = np.repeat(distance(n)[..., None], 3, axis=2)

@@ -94,12 +94,17 @@ def quads_of(distance, steps, amplitude=4000.0):
 
 def write(folder, *, tables_too=True, lookup=False, packets=1):
     """A folder of a dump of the scene; returns its codes."""
-    folder.mkdir()
     distance, steps = scene()
     codes = code_of(quads_of(distance, steps))
-    content = packet(codes)
-    for n in range(packets):
-        (folder / f"packet{n + 9}.bin").write_bytes(content)
+    write_codes(folder, [codes] * packets, steps, tables_too=tables_too, lookup=lookup)
+    return codes
+
+
+def write_codes(folder, packets, steps, *, tables_too=True, lookup=False):
+    """A folder of packets of nine images of codes, with the P0 steps of the sensor."""
+    folder.mkdir()
+    for n, codes in enumerate(packets):
+        (folder / f"packet{n + 9}.bin").write_bytes(packet(codes))
     (folder / "p0.bin").write_bytes(p0_response(steps))
     if tables_too:
         x, z = tables()
@@ -107,4 +112,3 @@ def write(folder, *, tables_too=True, lookup=False, packets=1):
         (folder / "z.bin").write_bytes(z)
     if lookup:
         (folder / "lut.bin").write_bytes(value_of_code().astype("<i2").tobytes())
-    return codes

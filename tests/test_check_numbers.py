@@ -98,6 +98,22 @@ def test_intervals_may_depend_on_the_slot():
     assert (name, "after raw frame 7" in text) == ("frame drops", True)
 
 
+def test_raw_frames_of_a_frequency_may_share_their_time():
+    """As those of a Kinect: three at one time, three times a cycle; two cycles show it."""
+    cycle = np.repeat([0.0, 0.3, 0.6], 3) / 30.0
+    changes = {"shifts": np.resize([0.0, 2.0, 4.0], 18), "cycle_length": 9}
+    times = np.concatenate([cycle, cycle + 1 / 30.0])
+    assert said(timing.gaps, recording(frames=18, times=times, **changes)) == []
+    late = np.concatenate([times, cycle + 4 / 30.0])
+    changes["shifts"] = np.resize(changes["shifts"], 27)
+    found = said(timing.gaps, recording(frames=27, times=late, **changes))
+    assert [name for name, _ in found] == ["frame drops"]
+    late[18:] -= 2 / 30.0
+    late[9:18] += 0.001
+    found = said(timing.gaps, recording(frames=27, times=late, **changes))
+    assert [name for name, _ in found] == ["trigger jitter"]
+
+
 def test_repeats_need_noise():
     """One equal raw frame among noisy ones is named; a scene at rest without noise is none."""
     sequence = recording()

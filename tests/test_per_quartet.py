@@ -31,7 +31,9 @@ KINDS = {  # shifts and frequencies of a cycle, constant part of the quads
     "five shifts": (tuple(2 * np.pi * k / 5 for k in (0, 2, 4, 1, 3)), (F,) * 5, 0.2),
     "two frequencies": ((0.0, 2.1, 4.2) * 2, (3 * F,) * 3 + (2 * F,) * 3, 0.0),
     "phasors": (CANONICAL_SHIFTS, (F,) * 4, 0.0),
+    "one instant": (CANONICAL_SHIFTS, (F,) * 4, 0.0),
 }
+AT_ONCE = ("phasors", "one instant")  # a cycle has one time
 
 
 @functools.cache
@@ -42,7 +44,7 @@ def recorded(kind="four shifts", *, frames=FRAMES, speed=1.0, noise=NOISE, seed=
     count = frames // cycle * cycle
     quads = []
     instants = np.arange(count)
-    if kind == "phasors":
+    if kind in AT_ONCE:
         instants = instants // cycle * cycle
     for n, instant in enumerate(instants):
         distance, reflectivity, _ = seen(speed * instant)

@@ -181,6 +181,10 @@ def test_a_constant_part_that_calibration_denies_is_warned_of(tmp_path, caplog):
     shifted = sequence.quads + np.abs(sequence.quads).max()
     reconstruct(replace(sequence, quads=shifted), tmp_path / "wrong", small("paper", 2))
     assert "constant part" in caplog.text
+    caplog.clear()
+    phasors = replace(small("paper", 2), input=Input.PHASOR)
+    reconstruct(replace(sequence, quads=shifted), tmp_path / "phasors", phasors)
+    assert "constant part" not in caplog.text
 
 
 def test_too_short_a_run_is_warned_of(tmp_path, caplog):

@@ -116,6 +116,17 @@ def test_what_was_not_fitted_to_quads_has_no_residuals(box):
     assert explained(recording(frames=3)[0], recording(frames=3)[0].quads) is None
 
 
+def test_ambient_light_is_no_failure_of_phasors(box):
+    """It is in single taps, differs from pixel to pixel, and a phasor does not contain it."""
+    measured, clean = box
+    ambient = np.linspace(0.5, 2.0, 48, dtype=np.float32)
+    lit = replace(measured, quads=measured.quads + ambient)
+    assert explained(lit, clean).unexplained_share > 0.9
+    found = explained(lit, clean, input="phasor")
+    assert found.reduced_chi_square == pytest.approx(1.0, abs=0.15)
+    assert found.unexplained_share < 1e-3
+
+
 def test_a_moving_camera_and_a_missing_frame(box):
     """Quartets that are not complete are left out; every raw frame has its own pose."""
     measured, clean = box

@@ -8,7 +8,7 @@ amplitude, which noise and a few moving pixels do not change, and scored by what
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -100,12 +100,32 @@ def constant_part(sequence: Sequence) -> ConstantPart:
     )
 
 
+def without_constant(sequence: Sequence) -> Sequence:
+    """The sequence without the constant part that its calibration does not explain, pixel by pixel
+    and quartet by quartet: ambient light in a tap, which no phasor contains.
+
+    Quads of incomplete quartets stay as they are.
+    """
+    quads, offset = sequence.quads.copy(), sequence.calibration.dc_offset
+    for i in sequence.complete_quartets:
+        for frames, (re, im) in quartet_phasors(sequence, i):
+            constant = constant_of(sequence.quads[frames], sequence.shifts[frames])
+            quads[frames] -= (constant - 0.5 * offset * np.hypot(re, im)).astype(np.float32)
+    return replace(sequence, quads=quads)
+
+
+def constant_of(
+    quads: Float[np.ndarray, "Q H W"], shifts: Float[np.ndarray, "Q"]
+) -> Float[np.ndarray, "H W"]:
+    """What quads of one frequency have besides a wave over their shifts [rad], by least squares."""
+    model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
+    return np.tensordot(np.linalg.pinv(model)[2], quads.astype(np.float64), axes=1)
+
+
 def _of_quartet(sequence: Sequence, i: int) -> Float[np.ndarray, "2 P"]:
     """Constant part and amplitude of every pixel and frequency of a quartet [quad units]."""
     columns = []
     for frames, (re, im) in quartet_phasors(sequence, i):
-        shifts = sequence.shifts[frames]
-        wave = 0.5 * (re * np.cos(shifts).mean() + im * np.sin(shifts).mean())
-        constant = sequence.quads[frames].mean(axis=0, dtype=np.float64) - wave
+        constant = constant_of(sequence.quads[frames], sequence.shifts[frames])
         columns.append(np.stack([constant.ravel(), 0.5 * np.hypot(re, im).ravel()]))
     return np.concatenate(columns, axis=1)

@@ -61,14 +61,14 @@ def exposure(sequence: Sequence, report: Report) -> None:
 def gaps(sequence: Sequence, report: Report) -> None:
     """Missing raw frames and irregular times, by the times."""
     steps, cycle = np.diff(sequence.times), sequence.cycle
-    at_once = bool((steps == 0.0).any())  # raw frames of a cycle may share their time
-    if at_once or len(steps) < 2 * cycle:
+    if len(steps) < 2 * cycle - 1:  # less than two cycles, of which nothing repeats
         steps, cycle = np.diff(np.unique(sequence.times)), 1
-    if len(steps) < 3:
+    if len(steps) < 3 or not (steps > 0.0).any():
         return
-    # the interval may depend on the slot of a cycle
-    usual = np.resize([np.median(steps[k::cycle]) for k in range(cycle)], len(steps))
-    typical = float(np.median(steps))
+    # the interval may depend on the slot of a cycle, whose raw frames may also share their time
+    of_slots = [np.quantile(steps[k::cycle], 0.5, method="lower") for k in range(cycle)]
+    usual = np.resize(of_slots, len(steps))
+    typical = float(np.median(steps[steps > 0.0]))
     late = np.flatnonzero(steps - usual > (DROPPED - 1.0) * typical)
     if len(late):
         report.warn(
@@ -77,8 +77,10 @@ def gaps(sequence: Sequence, report: Report) -> None:
             f"frame {_shown(late)}: if raw frames are missing, state them as not measured, or "
             "their shifts are those of others",
         )
-    others = np.delete(np.abs(steps - usual), late)
-    jitter = float(np.sqrt(np.square(others).mean())) / typical if typical > 0.0 else 0.0
+    others = np.maximum(steps, usual) > 0.0
+    others[late] = False
+    apart = np.square((steps - usual)[others])
+    jitter = float(np.sqrt(apart.mean())) / typical if len(apart) else 0.0
     if jitter > JITTER:
         report.warn(
             "trigger jitter",

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..data.constant import without_constant
 from ..data.decode import closed_form_distance, quad_scale, quartet_phasors
 from ..data.sequence import Flow, Sequence
 from ..errors import InputError
@@ -118,6 +119,12 @@ def input_of(sequence: Sequence, wanted: Input) -> Input:
     return Input.PHASOR if sequence.from_phasors else Input.QUADS
 
 
+def as_compared(sequence: Sequence, wanted: Input) -> Sequence:
+    """The sequence, without a constant part if its phasors are compared, which have none."""
+    phasors = input_of(sequence, wanted) == Input.PHASOR and not sequence.from_phasors
+    return without_constant(sequence) if phasors else sequence
+
+
 def observe(
     sequence: Sequence, settings: ReconSettings, device: torch.device | str
 ) -> Observations:
@@ -134,7 +141,7 @@ def observe(
         scale, scale_source = quad_scale(sequence)
     else:
         scale, scale_source = settings.quad_scale, "setting"
-    prepared = reduced(sequence, settings.width_max)
+    prepared = as_compared(reduced(sequence, settings.width_max), settings.input)
     source = settings.flow if reads_flow(settings) else FlowSource.NONE
     prepared, flow_source = with_flow(prepared, source)
     prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))

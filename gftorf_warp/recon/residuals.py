@@ -5,7 +5,8 @@ measured)^2 / sigma^2, with the noise sigma that is estimated from the recording
 explains everything but noise. Images are compared at the size at which they were fitted, each raw
 frame at its own time and pose. A pixel is *unexplained* if the same mean exceeds ``CHI_SQUARE_MAX``
 after an error of ``MODEL_ERROR`` of the amplitude was added to the noise: splats are no exact
-surfaces, and a few per cent of the amplitude are a few centimetres.
+surfaces, and a few per cent of the amplitude are a few centimetres. Where phasors were fitted,
+quads are compared without their constant part, which phasors do not contain.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from torch import Tensor
 
 from ..constants import SPEED_OF_LIGHT
 from ..data import temporal
-from ..data.decode import closed_form_distance, unambiguous_range
+from ..data.constant import constant_of
+from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
 from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of, quad_from_phasor
-from .observations import reduced
-from .settings import Method
+from .observations import as_compared, input_of, reduced
+from .settings import Input, Method
 
 LOG = logging.getLogger("gftorf_warp")
 CHI_SQUARE_MAX = 6.0  # noise alone exceeds it in 1e-4 of the pixels, with four raw frames
@@ -157,7 +159,10 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
     if not fitted or not settings.get("weights", {}).get("quads", 1.0) > 0:
         return None
     width, height = run.config.get("size_optimised", (sequence.width, sequence.height))
-    measured, camera = reduced(sequence, width), run.camera.resized(width, height)
+    wanted = Input(run.config.get("input", Input.QUADS))
+    measured = as_compared(reduced(sequence, width), wanted)
+    phasors = input_of(measured, wanted) == Input.PHASOR
+    camera = run.camera.resized(width, height)
     try:
         noise = quad_noise(measured)
     except InputError:  # shifts that determine no phase can be fitted, but not decoded
@@ -170,6 +175,8 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
     for i in measured.complete_quartets:
         apart, first = _quartet(run, measured, i, render, camera)
         distance.append(first)
+        if phasors:
+            apart = _without_constant(apart, measured, i)
         square = np.square(apart)
         amplitude = amplitudes_of(measured, i)
         variance = np.square(noise.sigma(amplitude))
@@ -210,6 +217,17 @@ def _quartet(
         if not distance:
             distance.append(rendering.distance.clone())  # the next rendering overwrites it
     return torch.stack(apart).double().cpu().numpy(), distance[0].cpu().numpy()
+
+
+def _without_constant(
+    apart: Float[np.ndarray, "K H W"], measured: Sequence, i: int
+) -> Float[np.ndarray, "K H W"]:
+    """Differences of the quads of quartet i without what no phasor contains."""
+    result, first = apart.copy(), measured.quartet_frames(i).start
+    for frames, _ in quartet_phasors(measured, i):
+        slots = np.array(frames) - first
+        result[slots] -= constant_of(apart[slots], measured.shifts[frames])
+    return result
 
 
 def _contradictions(

@@ -274,7 +274,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     if settings.method.is_volume:
         fit.check_volume(sequence, settings.method)
     observations = observe(sequence, settings, device)
-    _warn(sequence)
+    _warn(sequence, observations.sequence)
     earlier = 0.0 if stored is None else stored["seconds"]
 
     def clock() -> float:
@@ -355,11 +355,13 @@ def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, objec
     return {"flow_source": kind, "unfilled_share": share}
 
 
-def _warn(sequence: Sequence) -> None:
-    """Log what cannot be fitted: a wrong constant part (method, mistake 17), a rolling shutter."""
+def _warn(sequence: Sequence, compared: Sequence) -> None:
+    """Log what cannot be fitted: a wrong constant part of what is compared (method, mistake 17), a
+    rolling shutter.
+    """
     stated = sequence.calibration
     if sequence.complete_quartets and not sequence.from_phasors:
-        found = constant_part(sequence)
+        found = constant_part(compared)
         if not found.is_explained:
             text = (
                 "the quads have a constant part of %.2f amplitudes more than the calibration says"

@@ -210,7 +210,7 @@ class _Slots:
     """Raw frames of a quartet: when they were taken, and the phasor that explains them best."""
 
     share: Float[np.ndarray, "K"]
-    """Time from the middle of the quartet, in units of its duration."""
+    """Time from the middle of the quartet, in units of its duration; 0 if all have one time."""
     groups: list[tuple[Bool[np.ndarray, "K"], Float[np.ndarray, "k m"]]]
     """Raw frames of each frequency, and their model: quads = model @ (re, im, perhaps constant)."""
 
@@ -222,7 +222,7 @@ class _Slots:
     @property
     def decide(self) -> bool:
         """Whether one flow may explain the raw frames better than another: not those of three
-        shifts, nor those of a phasor, which have one time.
+        shifts, nor those that have one time, as those of a phasor.
         """
         return self.free > 0 and bool(self.share.any())
 
@@ -239,8 +239,8 @@ class _Slots:
             if constant or mask.sum() == 3:
                 columns.append(np.ones(mask.sum()))
             groups.append((mask, np.stack(columns, axis=1).astype(np.float32)))
-        at_once = np.zeros(len(times))
-        share = at_once if sequence.from_phasors else (times - times.mean()) / duration
+        at_once = sequence.from_phasors or duration == 0.0
+        share = np.zeros(len(times)) if at_once else (times - times.mean()) / duration
         return cls(share=share, groups=groups)
 
     def phasors(
