@@ -80,7 +80,7 @@ def test_a_recording_goes_the_whole_way(name, tmp_path, typed, monkeypatch):
     typed("export", run, "--out", exported, "--format", formats, "--times", "0", *CPU)
     with np.load(exported / "npz" / "frame_0000.npz") as arrays:
         away = np.abs(arrays["distance"] - recorded.distance)
-    assert np.nanmedian(away) < 0.05, "m"
+    assert np.nanmedian(away) < (0.1 if fitted else 0.05), "m"
     assert len((exported / "poses.txt").read_text().splitlines()) == 2
     if fitted:
         assert b"f_dc_0" in (exported / "ply" / "frame_0000.ply").read_bytes()
