@@ -23,11 +23,19 @@ author = "the authors of gftorf_warp"
 copyright = author
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
 root_doc = "index"
 
 myst_heading_anchors = 4
+linkcheck_ignore = [r"http://127\.0\.0\.1"]  # the viewer, while it runs
+linkcheck_timeout = 20  # [s]
+nb_execution_mode = "force"  # of docs/notebooks/, at every build, from nothing
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300  # [s] for a cell
+nb_execution_show_tb = True
+nb_merge_streams = True
 highlight_language = "none"  # commands and what they print
 smartquotes = False  # they make a dash of the two hyphens of an option
 

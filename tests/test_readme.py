@@ -99,6 +99,10 @@ def test_printed_commands_can_be_parsed():
 def test_links_of_the_readme_lead_to_files():
     """Those of all other pages are checked by the build of the site."""
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    links = re.findall(r"\]\(([^)#]+)", text)
+    links = re.findall(r"\]\(([^)#]+)#?([^)]*)\)", text)
     assert len(links) > 20
-    assert [link for link in links if not (REPOSITORY / link).is_file()] == []
+    assert [path for path, _ in links if not (REPOSITORY / path).is_file()] == []
+    for path, anchor in links:
+        if anchor:
+            page = (REPOSITORY / path).read_text(encoding="utf-8").lower().replace(" ", "-")
+            assert re.search(rf"^#+-{anchor}$", page, re.MULTILINE), f"{path}#{anchor}"

@@ -100,6 +100,11 @@ class Sequence:
 
     ``Sequence.open(path)`` reads a folder and ``sequence.truth()`` its ground truth;
     :mod:`gftorf_warp.data.read` binds both.
+
+    >>> from gftorf_warp import Sequence, simulate
+    >>> sequence = Sequence.open(simulate("demo", "demo", frames=8, size=(24, 18)))
+    >>> sequence.quads.shape, sequence.cycle, sequence.complete_quartets
+    ((8, 18, 24), 4, [0, 1])
     """
 
     quads: Float[np.ndarray, "F H W"]
@@ -196,7 +201,13 @@ class Sequence:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """Ground truth of a sequence, from simulation; for evaluation only."""
+    """Ground truth of a sequence, from simulation; for evaluation only.
+
+    >>> from gftorf_warp import Sequence, simulate
+    >>> truth = Sequence.open(simulate("demo", "demo", frames=8, size=(24, 18))).truth()
+    >>> truth.distance.shape, bool(truth.known.all())
+    ((8, 18, 24), True)
+    """
 
     distance: Float[np.ndarray, "F H W"]
     """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN:

@@ -76,6 +76,12 @@ def compare(
         UsageError: If ``frames`` is unknown or leaves nothing, or ``against`` is unknown.
         DivergedError: If a rendering is not finite.
         ResourceError: If memory or disk cannot hold the images or the page.
+
+    >>> from gftorf_warp import compare, reconstruct, simulate
+    >>> recording = simulate("demo", "demo", frames=8, size=(24, 18))
+    >>> metrics = compare(reconstruct(recording, "run", images=8))
+    >>> metrics["frames"], metrics["moving"]["closed_form_mse_x100"] > 0
+    (8, True)
     """
     if isinstance(run, (str, Path)):
         from ..recon.run import Run

@@ -89,6 +89,12 @@ def reconstruct(
         BusyError: If another process works on ``out``.
         DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
         KeyboardInterrupt: After a signal, when everything is stored.
+
+    >>> from gftorf_warp import reconstruct, simulate
+    >>> recording = simulate("demo", "demo", frames=8, size=(24, 18))
+    >>> run = reconstruct(recording, "run", images=8)  # 4,000 is the default
+    >>> run.render(time=0.0123).distance.shape
+    torch.Size([18, 24])
     """
     begun = time.monotonic()
     if not isinstance(sequence, Sequence):

@@ -24,6 +24,10 @@ class Background:
 
     Each field is broadcast to its image, so a number, [C, 1, 1] or [C, H, W] all work; all are
     differentiable.
+
+    >>> import torch
+    >>> from gftorf_warp import Background
+    >>> blue = Background(colour=torch.tensor([0.0, 0.0, 1.0])[:, None, None])
     """
 
     quads: Tensor | None = None
@@ -38,7 +42,23 @@ class Background:
 class Rendering:
     """Images of one rendering. With w = alpha T, and T_e the transmittance behind the last splat.
 
-    An image that was not requested has no elements.
+    An image that was not requested has no elements. Distance is a sum of weights, too short where
+    the opacity is below 1:
+
+    >>> import torch
+    >>> from gftorf_warp import Camera, GaussianField, Sensor, rasterize
+    >>> from gftorf_warp.scene.gaussians import constant_sh
+    >>> ball = GaussianField(
+    ...     mean=torch.tensor([[0.0, 0.0, 3.0]]),
+    ...     log_scale=torch.full((1, 3), 0.2).log(),
+    ...     quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+    ...     opacity_logit=torch.zeros(1),
+    ...     reflectivity_sh=constant_sh(torch.tensor([0.8])),
+    ... )
+    >>> camera = Camera.from_fov(65, 49, horizontal_fov_deg=60.0)
+    >>> images = rasterize(ball, camera, Sensor(), images=("distance", "opacity"))
+    >>> images.distance[24, 32].item(), images.opacity[24, 32].item(), len(images.phasor)
+    (1.5, 0.5, 0)
     """
 
     quads: Float[Tensor, "Q H W"]
@@ -133,6 +153,29 @@ def rasterize(
     Raises:
         ValueError: If a tensor is not float32 or lives elsewhere than the field, a parameter of the
             field is not finite, or there is no such image.
+
+    Example: a Gaussian 3 m away, its distance in the middle of the image, and the derivative of
+    that by its three coordinates.
+
+    >>> import torch
+    >>> from gftorf_warp import Camera, GaussianField, Sensor, rasterize
+    >>> from gftorf_warp.scene.gaussians import constant_sh
+    >>> centre = torch.tensor([[0.0, 0.0, 3.0]], requires_grad=True)
+    >>> ball = GaussianField(
+    ...     mean=centre,
+    ...     log_scale=torch.full((1, 3), 0.2).log(),
+    ...     quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+    ...     opacity_logit=torch.zeros(1),
+    ...     reflectivity_sh=constant_sh(torch.tensor([0.8])),
+    ... )
+    >>> camera = Camera.from_fov(65, 49, horizontal_fov_deg=60.0)
+    >>> images = rasterize(ball, camera, Sensor())
+    >>> images.quads.shape
+    torch.Size([4, 49, 65])
+    >>> distance = images.distance[24, 32] / images.opacity[24, 32]
+    >>> distance.backward()
+    >>> round(distance.item(), 3), [round(x, 3) + 0.0 for x in centre.grad[0].tolist()]
+    (3.0, [0.0, 0.0, 1.0])
     """
     count, size = len(field), (camera.height, camera.width)
     tensors: dict[str, Tensor | None] = dict.fromkeys(INPUTS)

@@ -69,7 +69,12 @@ class SplatDistance(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How Gaussians are rendered; alternatives to the exact defaults are for parity."""
+    """How Gaussians are rendered; alternatives to the exact defaults are for parity.
+
+    >>> from gftorf_warp import RenderSettings
+    >>> RenderSettings(splat_distance="plane", near=0.1).splat_distance
+    'plane'
+    """
 
     near: float = 0.05
     """Gaussians nearer than this z-depth are culled [m]."""

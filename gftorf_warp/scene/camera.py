@@ -31,7 +31,14 @@ class Guard(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
-    """A camera with axes x right, y down, z forward; pixel [0, 0] is centred at (0.5, 0.5)."""
+    """A camera with axes x right, y down, z forward; pixel [0, 0] is centred at (0.5, 0.5).
+
+    >>> import torch
+    >>> from gftorf_warp import Camera
+    >>> camera = Camera.from_fov(64, 48, horizontal_fov_deg=90.0)
+    >>> camera.project(torch.tensor([0.5, 0.0, 1.0])).tolist()
+    [48.0, 24.0]
+    """
 
     width: int
     """Columns W of the image."""

@@ -13,7 +13,23 @@ from ..constants import SH_BIAS, SH_COEFFICIENTS, SH_Y0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GaussianField:
-    """N Gaussians. All tensors share a device and float32 (float64 is for the oracle)."""
+    """N Gaussians. All tensors share a device and float32 (float64 is for the oracle).
+
+    Example: a ball of 20 cm, half opaque, 3 m before the camera.
+
+    >>> import torch
+    >>> from gftorf_warp import GaussianField
+    >>> from gftorf_warp.scene.gaussians import constant_sh
+    >>> ball = GaussianField(
+    ...     mean=torch.tensor([[0.0, 0.0, 3.0]]),
+    ...     log_scale=torch.full((1, 3), 0.2).log(),
+    ...     quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+    ...     opacity_logit=torch.zeros(1),
+    ...     reflectivity_sh=constant_sh(torch.tensor([0.8])),
+    ... )
+    >>> len(ball), float(ball.opacity[0])
+    (1, 0.5)
+    """
 
     mean: Float[Tensor, "N 3"]
     """Centre in the world [m]."""

@@ -57,7 +57,13 @@ class RawFrame(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Sensor:
-    """One C-ToF sensor. The ``Scalar`` fields accept 0-d tensors, which receive gradients."""
+    """One C-ToF sensor. The ``Scalar`` fields accept 0-d tensors, which receive gradients.
+
+    >>> from gftorf_warp import Sensor
+    >>> sensor = Sensor(f_mod_hz=20e6, further_hz=(50e6,))
+    >>> len(sensor.cycle), round(sensor.unambiguous_range, 3)
+    (8, 7.495)
+    """
 
     f_mod_hz: Scalar = SPEED_OF_LIGHT / 15.0
     """Modulation frequency [Hz]; default: 19.986 MHz, of public F-ToeRF files (range 15 m)."""

@@ -20,6 +20,11 @@ class SimSettings:
 
     Raises:
         UsageError: If a value is out of range, or two values contradict each other.
+
+    >>> from gftorf_warp import SimSettings, simulate
+    >>> settings = SimSettings(frames=8, size=(24, 18), overrides=("sensor.f_mod_hz=30e6",))
+    >>> simulate("demo", "at-30-MHz", settings).name
+    'at-30-MHz'
     """
 
     frames: int | None = None

@@ -66,6 +66,11 @@ def simulate(
         ResourceError: If memory or disk cannot hold the recording.
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
+
+    >>> from gftorf_warp import simulate
+    >>> folder = simulate("demo", "demo", frames=8, size=(24, 18))
+    >>> (folder / "README.md").read_text().splitlines()[0]
+    '# demo: simulated C-ToF sequence'
     """
     settings = replace(settings, **changes)
     own = scene_of(scene, settings.overrides, settings.seed)

@@ -36,7 +36,15 @@ KINDS: dict[str, type[Run]] = {}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run(StoredRun):
-    """What :func:`gftorf_warp.reconstruct` returns, and what is found again in its folder."""
+    """What :func:`gftorf_warp.reconstruct` returns, and what is found again in its folder.
+
+    >>> from gftorf_warp import Run, reconstruct, simulate
+    >>> recording = simulate("demo", "demo", frames=8, size=(24, 18))
+    >>> path = reconstruct(recording, "run", images=8).path
+    >>> run = Run.open(path)
+    >>> run.render(time=0.0123, camera=run.camera.resized(48, 36)).distance.shape
+    torch.Size([36, 48])
+    """
 
     @classmethod
     def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
