@@ -52,6 +52,7 @@ from gftorf_warp.kernels.training import (
     ordered_sums,
     step_end,
 )
+from gftorf_warp.kernels.volume import hash_grid
 from gftorf_warp.render.buffers import SEGMENTS, TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
@@ -81,6 +82,7 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "trace": rays.trace_hits.module,
         "paths": light_paths.trace_light.module,
         "surface": signed_distance.fuse.module,
+        "hash grid": hash_grid.interpolate.module,
         "perceptron": perceptron.pack.module,
         "slopes": gradient_scaling.add_partials.module,
         "rows": gradient_rows.list_rows.module,

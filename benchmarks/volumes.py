@@ -1,13 +1,13 @@
 """What a step of a neural volume costs at the published size, and what a whole run would take.
 
-    python benchmarks/volumes.py [--preset ftorf|torf] [--steps N] [--products float32|half ..]
-                                 [--device cpu|cuda] [--sequence SEQ] [--set NAME=VALUE ..]
-                                 [--profile] [--json FILE]
+    python benchmarks/volumes.py [--preset ftorf|torf|volume] [--steps N]
+                                 [--products float32|half ..] [--device cpu|cuda] [--sequence SEQ]
+                                 [--set NAME=VALUE ..] [--profile] [--json FILE]
 
 Without a sequence, 60 raw frames of ``sliding_cube`` are simulated. Each row times N steps, updates
-of Adam included, after a warm-up of a tenth as many: for ``ftorf`` those in which a quartet is
-simultaneous and those with scene flow, for ``torf`` all alike. ``whole run`` extrapolates to the
-steps of the preset; ``image`` is the rendering of one raw frame at the size of the sequence.
+of Adam included, after a warm-up of a tenth as many: for ``ftorf`` and ``volume`` those in which a
+quartet is simultaneous and those with scene flow, for ``torf`` all alike. ``whole run``
+extrapolates to the steps of the preset; ``image`` is the rendering of one raw frame at the size of the sequence.
 With ``--profile`` what ran longest in ten steps is listed under every row.
 """
 
@@ -60,7 +60,7 @@ def main() -> None:
 def parsed() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--preset", choices=("ftorf", "torf"), default="ftorf")
+    parser.add_argument("--preset", choices=("ftorf", "torf", "volume"), default="ftorf")
     parser.add_argument("--steps", type=int, default=200, help="of each kind")
     parser.add_argument("--products", nargs="+", default=["float32", "half"])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -100,7 +100,7 @@ def measured(
     total = settings.schedule.images
     starts = {"steps": 0}
     shares = {"steps": 1.0}
-    if options.preset == "ftorf":
+    if options.preset != "torf":
         share = settings.volume.scene_flow.simultaneous_share
         starts = {"simultaneous": 0, "scene flow": round(share * total) + 1}
         shares = {"simultaneous": share, "scene flow": 1.0 - share}

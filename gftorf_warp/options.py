@@ -188,7 +188,7 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct.option("--out", "RUN", str, out, required=True)
     presets = "settings: best, demo, paper, released, fast, dgs, dgs_depth, or without Gaussians "
     presets += "ctof, the closed form, temporal, the same averaged over time, and flow2d, the same "
-    presets += "after optical flow, or neural volumes torf and ftorf (best)"
+    presets += "after optical flow, or neural volumes torf, ftorf and volume (best)"
     reconstruct.option("--preset", "NAME", str, presets, "best")
     inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
     reconstruct.option("--input", "KIND", str, inputs, "auto")

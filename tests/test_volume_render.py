@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from gftorf_warp.recon.volume import composite
 from gftorf_warp.recon.volume.composite import Samples
 from gftorf_warp.recon.volume.network import TimeCodes, VolumeNetwork
-from gftorf_warp.recon.volume.rays import Views, mean_pose, z_depths
+from gftorf_warp.recon.volume.rays import Depths, Views, evenly, mean_pose
 from gftorf_warp.recon.volume.settings import NetworkSettings, TimeCode
 from gftorf_warp.render import reference
 from gftorf_warp.render.buffers import RenderSettings
@@ -94,7 +94,9 @@ def test_a_thin_medium_is_the_integral_of_its_phasor():
     """Density s from 1 m on: the integral of s exp(-2 s (d - 1)) exp(i kappa d) to infinity."""
     density, slope = 8.0, float(SENSOR.phase_slope)
     z = torch.linspace(1.0, 5.0, 8001, dtype=torch.float64)[None]
-    alpha = composite.opacities(torch.full_like(z, density), z, torch.ones(1))
+    alpha = composite.opacities(
+        torch.full_like(z, density), Depths.between(z).interval, torch.ones(1)
+    )
     samples = Samples(distance=z, alpha=alpha, strength=alpha)
     re, im, _ = composite.phasor(samples, SENSOR, samples.transmittance)[:, 0].tolist()
     start = np.exp(1j * (slope + SENSOR.phase_offset))
@@ -108,7 +110,9 @@ def test_the_last_sample_closes_the_volume():
     """
     z = torch.tensor([[1.0, 1.5, 2.0]], dtype=torch.float64)
     raw = torch.tensor([[-1.0, 0.4, 1e-3]], dtype=torch.float64)
-    alpha = composite.opacities(raw, z, torch.tensor([1.2], dtype=torch.float64))[0]
+    alpha = composite.opacities(
+        raw, Depths.between(z).interval, torch.tensor([1.2], dtype=torch.float64)
+    )[0]
     assert_close(alpha, torch.tensor([0.0, 1.0 - math.exp(-0.4 * 0.6), 1.0], dtype=torch.float64))
 
 
@@ -122,7 +126,7 @@ def test_gradients_agree_with_finite_differences():
     length = torch.tensor([1.0, 1.3], dtype=torch.float64)
 
     def images(raw, light, tint):
-        alpha = composite.opacities(raw, z, length)
+        alpha = composite.opacities(raw, Depths.between(z).interval, length)
         samples = Samples(
             distance=z * length[:, None],
             alpha=alpha,
@@ -206,7 +210,7 @@ def test_rays_and_their_samples():
     views = Views(cameras, pose, "cpu")
     pixels = torch.tensor([0, 9, 23])
     rays = views.rays(1, pixels)
-    z = z_depths((1.0, 3.0), 3, 8, pixels.device, generator())
+    z = evenly((1.0, 3.0), 3, 8, pixels.device, generator()).z
     world = rays.at(z) + torch.tensor([0.0, 0.1, 0.0])
     centres = torch.tensor([[0.5, 0.5], [3.5, 1.5], [5.5, 3.5]])
     assert_close(cameras[1].project(world), centres[:, None].expand(3, 8, 2), atol=1e-4, rtol=0)
@@ -214,6 +218,6 @@ def test_rays_and_their_samples():
     assert_close(depth, z, atol=1e-5, rtol=0)
     distance = (world - torch.tensor([-0.5, 0.2, 0.0])).norm(dim=-1)
     assert_close(z * rays.length[:, None], distance, atol=1e-5, rtol=0)
-    even = z_depths((1.0, 3.0), 3, 8, pixels.device)
+    even = evenly((1.0, 3.0), 3, 8, pixels.device).z
     assert (z[:, 1:] > z[:, :-1]).all()
     assert 0.01 < (z - even).abs().max() <= 1.0 / 7.0 + 1e-6

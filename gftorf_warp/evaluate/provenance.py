@@ -34,6 +34,8 @@ METHOD_WORDS = {
     "colour by gradient descent; our own code after TöRF",
     "ftorf": "a neural volume with 3D scene flow, fitted to raw quads at their own times by "
     "gradient descent; our own code after F-TöRF",
+    "volume": "a neural volume (ours) of hash grids with 3D scene flow, fitted to raw quads at "
+    "their own times by gradient descent; after no publication",
 }
 INPUT_WORDS = {
     "quads": "quads: every raw frame at its own time and phase shift",

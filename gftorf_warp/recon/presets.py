@@ -32,7 +32,13 @@ from .settings import (
     Schedule,
     Weights,
 )
-from .volume.settings import PUBLISHED_STEPS, NetworkSettings, TimeCode, VolumeSettings
+from .volume.settings import (
+    PUBLISHED_STEPS,
+    GridSettings,
+    NetworkSettings,
+    TimeCode,
+    VolumeSettings,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,6 +348,35 @@ def ftorf(recorded: Recorded = Recorded()) -> ReconSettings:
     )
 
 
+def volume(recorded: Recorded = Recorded()) -> ReconSettings:
+    """A neural volume of our own in minutes: losses and scene flow of ``ftorf`` with hash grids
+    (recon/volume/grid_volume.py). Needs a resting camera.
+    """
+    base = ftorf(recorded)
+    assert base.volume is not None
+    scene_flow = replace(base.volume.scene_flow, simultaneous_share=0.1)
+    return replace(
+        base,
+        preset="volume",
+        method=Method.VOLUME,
+        volume=replace(
+            base.volume,
+            grid=GridSettings(),
+            scene_flow=scene_flow,
+            rays=8192,
+            accumulated=1,
+            samples=48,
+            density_noise=0.0,
+            rate=1e-2,
+            rate_tenth_after=GRID_STEPS,
+            gradient_max=None,
+            epsilon=1e-15,
+        ),
+        schedule=Schedule(images=GRID_STEPS),
+    )
+
+
+GRID_STEPS = 6000  # of ``volume``
 FALLOFF_RANGE = 7.5  # [m] F of the published synthetic scenes, at which falloffs are L^2 / F^2
 DEPTH_WEIGHT = 0.1  # [1/m] unpublished
 # [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
@@ -361,6 +396,7 @@ PRESETS: dict[str, Callable[[Recorded], ReconSettings]] = {
         flow2d,
         torf,
         ftorf,
+        volume,
     )
 }
 """All presets by name."""

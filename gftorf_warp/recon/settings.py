@@ -42,11 +42,13 @@ class Method(enum.StrEnum):
     """A neural volume fitted to phasors and colour."""
     FTORF = "ftorf"
     """A neural volume fitted to raw quads at their own times."""
+    VOLUME = "volume"
+    """The same with hash grids instead of a large network, of our own."""
 
     @property
     def is_volume(self) -> bool:
         """Whether a neural volume is fitted."""
-        return self in (Method.TORF, Method.FTORF)
+        return self in (Method.TORF, Method.FTORF, Method.VOLUME)
 
     @property
     def fits(self) -> bool:
@@ -288,8 +290,8 @@ class ReconSettings:
     motion: MotionSettings = field(default_factory=MotionSettings)
     """The motion model."""
     volume: VolumeSettings | None = None
-    """The neural volume of methods ``torf`` and ``ftorf``, which have neither Gaussians nor their
-    ``init``, ``motion``, ``rates``, ``densify`` and ``render``; None: of no other."""
+    """The neural volume of methods ``torf``, ``ftorf`` and ``volume``, which have neither Gaussians
+    nor their ``init``, ``motion``, ``rates``, ``densify`` and ``render``; None: of no other."""
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)

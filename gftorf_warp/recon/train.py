@@ -152,7 +152,9 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why="it needs the flow of every raw frame, which no file contains",
             fix="use --flow dis or --flow deepflow",
         )
-    wanted = {Method.TORF: Input.PHASOR, Method.FTORF: Input.QUADS}.get(settings.method)
+    wanted = None
+    if settings.method.is_volume:
+        wanted = Input.PHASOR if settings.method == Method.TORF else Input.QUADS
     if wanted is not None and (settings.input != wanted or input not in (Input.AUTO, wanted)):
         raise UsageError(
             f"another input does not fit preset {settings.preset}",
@@ -164,12 +166,12 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
         raise UsageError(
             f"volume.network.static does not fit preset {settings.preset}",
             where="--set",
-            why="torf blends a network without time, ftorf has none",
+            why="torf blends a network without time, the others have none",
             fix="leave volume.network.static out",
         )
-    if settings.method == Method.FTORF and settings.weights.colour > 0:
+    if wanted == Input.QUADS and settings.weights.colour > 0:
         raise UsageError(
-            "weights.colour does not fit preset ftorf",
+            f"weights.colour does not fit preset {settings.preset}",
             where="--set",
             why="it is fitted to raw frames alone",
             fix="leave weights.colour out, or use --preset torf",

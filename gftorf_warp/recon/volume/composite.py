@@ -19,7 +19,6 @@ from torch import Tensor
 
 from ...scene.sensor import Sensor
 
-CLOSED = 1e10  # [m] length of the last interval
 OPAQUE = 1e-10  # [1] kept of the light behind an opaque sample, so that its logarithm exists
 
 
@@ -45,12 +44,12 @@ class Samples:
 
 
 def opacities(
-    raw: Float[Tensor, "*b R S"], z: Float[Tensor, "R S"], length: Float[Tensor, "R"]
+    raw: Float[Tensor, "*b R S"], interval: Float[Tensor, "R S"], length: Float[Tensor, "R"]
 ) -> Float[Tensor, "*b R S"]:
-    """Alpha of densities before their ReLU [1/m], at z-depths [m] on rays of length |D| [1]."""
-    end = torch.full_like(z[:, :1], CLOSED)
-    interval = torch.cat([z[:, 1:] - z[:, :-1], end], dim=-1) * length[:, None]
-    return 1.0 - torch.exp(-torch.relu(raw) * interval)
+    """Alpha of densities before their ReLU [1/m] that stand for intervals of z-depth [m], on rays
+    of length |D| [1].
+    """
+    return 1.0 - torch.exp(-torch.relu(raw) * interval * length[:, None])
 
 
 def quads(
@@ -103,6 +102,14 @@ def expected(
     """Sum of alpha T times a value of the samples, not divided by the opacity."""
     weight = samples.alpha * transmittance
     return (weight.reshape(*weight.shape, *[1] * (value.ndim - 2)) * value).sum(dim=1)
+
+
+def distortion(samples: Samples, transmittance: Float[Tensor, "*b R S"]) -> Float[Tensor, "*b R"]:
+    """Sum over pairs of samples k, l of w_k w_l (d_k - d_l)^2, w = alpha T [m^2]."""
+    weight = samples.alpha * transmittance
+    opacity = weight.sum(dim=-1)
+    mean, square = ((weight * samples.distance**power).sum(dim=-1) for power in (1, 2))
+    return (2.0 * (opacity * square - mean.square())).clamp_min(0.0)
 
 
 def median_distance(samples: Samples, transmittance: Float[Tensor, "R S"]) -> Float[Tensor, "R"]:

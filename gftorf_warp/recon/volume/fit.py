@@ -28,18 +28,18 @@ def check_volume(sequence: Sequence, method: Method) -> None:
     """Refuse what cannot be fitted by a volume.
 
     Raises:
-        InputError: If no quartet is complete, or for ``ftorf`` the camera moves or delivered
-            phasors.
+        InputError: If no quartet is complete, or for another method than ``torf`` the camera
+            moves or delivered phasors.
     """
     where, fix = sequence.path or "sequence", "use --preset torf, or best"
     if not sequence.complete_quartets:
         why = "expected all raw frames of a cycle in a row, at least once"
         fix = "check the sequence with `gftorf check`, or record longer"
         raise InputError("no complete quartet", where=where, why=why, fix=fix)
-    if method != Method.FTORF:
+    if method == Method.TORF:
         return
     if sequence.from_phasors:
-        why = "the camera delivered phasors, and ftorf is fitted to raw frames at their own times"
+        why = f"the camera delivered phasors, and {method} compares raw frames at their own times"
         raise InputError("no raw frames", where=where, why=why, fix=fix)
     if not camera_rests(sequence):
         why = "the samples of all raw frames of a cycle are on the rays of one pose, as published"

@@ -24,7 +24,7 @@ from torch import Tensor
 from ..settings import Method, ReconSettings
 from . import composite
 from .composite import Samples
-from .rays import Rays, z_depths
+from .rays import Depths, Rays
 from .targets import Around, Draw, Targets
 from .volume import Volume
 
@@ -70,27 +70,28 @@ class Ftorf(Volume):
         options, quartet = self.settings.scene_flow, draw.one_of(self.box.quartets)
         pixels = draw.pixels(self.settings.rays, targets.views.pixels)
         rays = targets.views.rays(self.box.cycle * quartet, pixels)
-        z = z_depths(
-            self.box.bounds, len(pixels), self.settings.samples, pixels.device, draw.device
-        )
-        points, weight = rays.at(z), settings.weights.quads
+        depths, weight = self.depths(rays, draw), settings.weights.quads
+        points = rays.at(depths.z)
         if step < options.simultaneous_share * settings.schedule.images:
             with self.precision():
                 trunk = self.trunk(points[None], [quartet])
-                samples = self.samples(trunk, rays, z, draw=draw)
+                samples = self.samples(trunk, rays, depths, draw=draw)
             around = targets.around(quartet, after_only=True)
             mse = self._errors(targets, around, samples, pixels).mean()
-            return {"quads": weight * mse, "quad_mse": mse.detach()}
-        around = targets.around(quartet)
+            more = self.more_terms(rays, depths, samples, step, settings)
+            return {"quads": weight * mse, "quad_mse": mse.detach()} | more
+        every = targets.around(quartet)
+        around = self.compared(every, draw)
         with self.precision():
             own, flows = self._quartet(quartet, points)
             beside, gap = self._beside(around, quartet, points, flows)
-            samples = self.samples(torch.cat([own, beside]), rays, z, draw=draw)
+            samples = self.samples(torch.cat([own, beside]), rays, depths, draw=draw)
         errors = self._errors(targets, around, samples, pixels)
-        kept = max(1, round(options.kinetic_share * z.shape[1]))
+        larger = (len(every.frames) - 1) / max(1, len(around.frames) - 1)
+        kept = max(1, round(options.kinetic_share * depths.z.shape[1]))
         both = (flows.forward + flows.backward)[:, :kept]
         terms = {
-            "quads": weight * errors.sum(),
+            "quads": weight * (errors[0] + larger * errors[1:].sum()),
             "size": options.size * 0.5 * (flows.forward.abs() + flows.backward.abs()).mean(),
             "kinetic": options.kinetic * 0.5 * both.square().sum(dim=-1).mean(),
             "round_trip": options.round_trip * gap,
@@ -99,8 +100,35 @@ class Ftorf(Volume):
         weight = settings.weights.flow * max(0.0, 1.0 - step / options.vanishes_at)
         if weight > 0 and quartet in targets.flow_rows:
             measured = targets.flow[targets.flow_rows[quartet]][..., pixels]
-            terms["flow"] = weight * self._projected(targets, measured, samples, rays, z, flows)
-        return terms
+            seen = rays.at((_weights(samples)[0] * depths.z).sum(dim=-1))
+            terms["flow"] = weight * self._projected(targets, measured, samples, seen, flows)
+        return terms | self.more_terms(rays, depths, samples, step, settings)
+
+    def compared(self, around: Around, draw: Draw) -> Around:  # noqa: ARG002
+        """Which of the raw frames around a quartet start a step compares: all."""
+        return around
+
+    def more_terms(
+        self,
+        rays: Rays,  # noqa: ARG002
+        depths: Depths,  # noqa: ARG002
+        samples: Samples,  # noqa: ARG002
+        step: int,  # noqa: ARG002
+        settings: ReconSettings,  # noqa: ARG002
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the loss that were not published: none."""
+        return {}
+
+    def values_and_flow(
+        self,
+        points: Float[Tensor, "T R S 3"],
+        quartets: list[int],
+        seen: slice,
+        flowing: slice,
+    ) -> tuple[Float[Tensor, "t R S w"], Float[Tensor, "u R S 2 3"]]:
+        """Values of some rows of points at the quartets of the rows, and scene flow [m] of some."""
+        trunk = self.trunk(points, quartets)
+        return trunk[seen], self.moving.flow(trunk[flowing], self.box.reach)
 
     def _quartet(
         self, quartet: int, points: Float[Tensor, "R S 3"]
@@ -108,8 +136,8 @@ class Ftorf(Volume):
         """Values and flows at a quartet; the flows of its neighbours are of the same products."""
         before, after = quartet - 1 in self.box.quartets, quartet + 1 in self.box.quartets
         quartets = [quartet] + [quartet - 1] * before + [quartet + 1] * after
-        trunk = self.trunk(points.expand(len(quartets), *points.shape), quartets)
-        flow = self.moving.flow(trunk, self.box.reach)
+        rows = points.expand(len(quartets), *points.shape)
+        own, flow = self.values_and_flow(rows, quartets, slice(1), slice(None))
         forward, backward = flow[0, ..., FORWARD, :], flow[0, ..., BACKWARD, :]
         flows = Neighbours(
             forward=forward,
@@ -117,7 +145,7 @@ class Ftorf(Volume):
             from_before=flow[1, ..., FORWARD, :] if before else forward,
             from_after=flow[-1, ..., BACKWARD, :] if after else backward,
         )
-        return trunk[:1], flows
+        return own, flows
 
     def _beside(
         self, around: Around, quartet: int, points: Float[Tensor, "R S 3"], flows: Neighbours
@@ -134,13 +162,14 @@ class Ftorf(Volume):
         moved = [points + before * flows.from_before, points + after * flows.from_after]
         moved += [(points + flow)[None] for flow in ways.values()]
         count = len(before) + len(after)
-        trunk = self.trunk(torch.cat(moved), [quartet] * count + [*ways])
-        back = self.moving.flow(trunk[count:], self.box.reach)
+        beside, back = self.values_and_flow(
+            torch.cat(moved), [quartet] * count + [*ways], slice(count), slice(count, None)
+        )
         gaps = [
             (flow + found[..., BACKWARD if other > quartet else FORWARD, :]).abs().mean()
             for (other, flow), found in zip(ways.items(), back, strict=True)
         ]
-        return trunk[:count], torch.stack(gaps).sum() if gaps else points.new_zeros(())
+        return beside, torch.stack(gaps).sum() if gaps else points.new_zeros(())
 
     def _errors(
         self, targets: Targets, around: Around, samples: Samples, pixels: Int[Tensor, "R"]
@@ -157,15 +186,13 @@ class Ftorf(Volume):
         targets: Targets,
         measured: Float[Tensor, "2 2 R"],
         samples: Samples,
-        rays: Rays,
-        z: Float[Tensor, "R S"],
+        seen: Float[Tensor, "R 3"],
         flows: Neighbours,
     ) -> Tensor:
         """Mean absolute difference to the optical flow of a quartet start [px], where known; the
         first of the samples are those of the start.
         """
-        weight, nearest = (samples.alpha * samples.transmittance)[0], 0.5 * self.box.bounds[0]
-        seen = rays.at((weight * z).sum(dim=-1))
+        weight, nearest = _weights(samples)[0], 0.5 * self.box.bounds[0]
         start, known = _image(targets, seen, nearest), measured.isfinite()
         gaps = []
         for direction, flow in ((FORWARD, flows.forward), (BACKWARD, flows.backward)):
@@ -174,21 +201,27 @@ class Ftorf(Volume):
             gaps.append(torch.where(known[direction], apart, torch.zeros_like(apart)).abs().sum())
         return torch.stack(gaps).sum() / known.sum().clamp_min(1)
 
-    def samples_at(self, time: float, rays: Rays, z: Float[Tensor, "R S"]) -> Samples:
+    def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
         """Samples moved from the nearest quartet start to a time [s]."""
         starts = np.array(self.box.quartet_times)[self.box.quartets]
         # the last quartet lasts for a period
         time = float(np.clip(time, starts[0], starts[-1] + self.box.period))
         nearest = int(np.abs(starts - time).argmin())
-        quartet, points = self.box.quartets[nearest], rays.at(z)
+        quartet, points = self.box.quartets[nearest], rays.at(depths.z)
         share = (time - starts[nearest]) / self.box.period
         with self.precision():
             if share != 0.0:
                 beside = quartet + (1 if share > 0 else -1)
                 source = beside if beside in self.box.quartets else quartet
-                flow = self.moving.flow(self.trunk(points[None], [source])[0], self.box.reach)
-                points = points + abs(share) * flow[..., BACKWARD if share > 0 else FORWARD, :]
-            return self.samples(self.trunk(points[None], [quartet])[0], rays, z)
+                nothing, all_rows = slice(0), slice(None)
+                _, flow = self.values_and_flow(points[None], [source], nothing, all_rows)
+                points = points + abs(share) * flow[0, ..., BACKWARD if share > 0 else FORWARD, :]
+            return self.samples(self.trunk(points[None], [quartet])[0], rays, depths)
+
+
+def _weights(samples: Samples) -> Float[Tensor, "*b R S"]:
+    """Weights alpha T of samples [1]."""
+    return samples.alpha * samples.transmittance
 
 
 def _image(targets: Targets, points: Float[Tensor, "R 3"], nearest: float) -> Float[Tensor, "R 2"]:

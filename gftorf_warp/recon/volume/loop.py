@@ -25,7 +25,6 @@ from .targets import Draw, Targets
 from .volume import Volume
 
 LOG = logging.getLogger("gftorf_warp")
-EPSILON = 1e-7  # of Adam, Keras' default
 
 
 class VolumeState:
@@ -35,7 +34,7 @@ class VolumeState:
         """Begin at step 0."""
         self.volume, self.images, self.seconds = volume, 0, 0.0
         self.optimiser = torch.optim.Adam(
-            volume.parameters(), lr=settings.rate, eps=EPSILON, fused=True
+            volume.parameters(), lr=settings.rate, eps=settings.epsilon, fused=True
         )
         half = settings.products == Products.HALF
         self.scaler = torch.amp.GradScaler(volume.device.type, enabled=half)

@@ -10,12 +10,13 @@ import torch
 from ...errors import InputError
 from ..settings import Method
 from .ftorf import Ftorf
+from .grid_volume import GridVolume
 from .settings import VolumeSettings
 from .targets import Targets
 from .torf import Torf
 from .volume import Box, Volume, box_of
 
-VOLUMES: dict[Method, type[Volume]] = {kind.method: kind for kind in (Torf, Ftorf)}
+VOLUMES: dict[Method, type[Volume]] = {kind.method: kind for kind in (Torf, Ftorf, GridVolume)}
 """All final classes of Volume."""
 
 
@@ -38,7 +39,7 @@ def volume_from_dict(
 
     Args:
         run: Folder of the run, for messages.
-        method: ``torf`` or ``ftorf``.
+        method: ``torf``, ``ftorf`` or ``volume``.
         settings: How it is sampled.
         stored: The checkpoint; its ``volume`` is what :meth:`Volume.to_dict` returned.
         device: Where it is wanted.
@@ -48,8 +49,7 @@ def volume_from_dict(
     """
     generator = torch.Generator().manual_seed(0)  # its numbers are replaced
     try:
-        box = stored["volume"]["box"] | {"bounds": tuple(stored["volume"]["box"]["bounds"])}
-        volume = VOLUMES[method](settings, Box(**box), generator)
+        volume = VOLUMES[method](settings, Box(**stored["volume"]["box"]), generator)
         volume.load_state_dict(stored["volume"]["weights"])
     except (LookupError, TypeError, ValueError, RuntimeError) as error:
         why = f"it holds no networks of the shape in config.json: {str(error).splitlines()[0]}"

@@ -17,6 +17,8 @@ from torch import Tensor
 
 from ...scene.camera import Camera
 
+CLOSED = 1e10  # [m] interval of the last sample, behind which is nothing
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rays:
@@ -42,6 +44,22 @@ class Rays:
         return Rays(origin=self.origin[which], direction=self.direction[which])
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Depths:
+    """Where the S samples of R rays are."""
+
+    z: Float[Tensor, "R S"]
+    """Their z-depths [m]."""
+    interval: Float[Tensor, "R S"]
+    """The z-depths [m] that each stands for."""
+
+    @classmethod
+    def between(cls, z: Float[Tensor, "R S"]) -> Depths:
+        """Samples that stand for the way to the next one; the last one has no end."""
+        end = torch.full_like(z[:, :1], CLOSED)
+        return cls(z=z, interval=torch.cat([z[:, 1:] - z[:, :-1], end], dim=-1))
+
+
 class Views:
     """The rays of V cameras of one size and lens, on a device."""
 
@@ -61,6 +79,18 @@ class Views:
             [volume_from_world @ np.linalg.inv(camera.camera_from_world) for camera in cameras]
         )
         self._volume_from_camera = torch.tensor(poses, dtype=torch.float32, device=device)
+
+    def spread(self, bounds: tuple[float, float]) -> tuple[float, float]:
+        """Largest |x / z| and |y / z| of the points of all rays between two z-depths [m]."""
+        ends = torch.tensor(bounds, device=self._local.device).expand(self.pixels, 2)
+        poses = torch.unique(self._volume_from_camera, dim=0)
+        found = []
+        for pose in poses:
+            direction = self._local @ pose[:3, :3].T
+            at = pose[:3, 3] + ends[..., None] * direction[:, None]
+            found.append((at[..., :2] / at[..., 2:].clamp_min(0.5 * bounds[0])).abs().amax((0, 1)))
+        x, y = torch.stack(found).amax(0).tolist()
+        return x, y
 
     def rays(self, view: int, pixels: Int[Tensor, "R"] | None = None) -> Rays:
         """The rays of some pixels, numbered row by row, or of all."""
@@ -82,14 +112,14 @@ def mean_pose(camera_from_world: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray
     return np.linalg.inv(middle)
 
 
-def z_depths(
+def evenly(
     bounds: tuple[float, float],
     rays: int,
     samples: int,
     device: torch.device,
     generator: torch.Generator | None = None,
-) -> Float[Tensor, "R S"]:
-    """z-depths [m] of samples, evenly from the first bound to the last.
+) -> Depths:
+    """Samples evenly from the first bound to the last.
 
     Args:
         bounds: z-depths of the first and the last sample [m].
@@ -100,9 +130,9 @@ def z_depths(
     """
     z = torch.linspace(*bounds, samples, device=device).expand(rays, samples)
     if generator is None:
-        return z
+        return Depths.between(z)
     middle = 0.5 * (z[:, 1:] + z[:, :-1])
     lower = torch.cat([z[:, :1], middle], dim=1)
     upper = torch.cat([middle, z[:, -1:]], dim=1)
     share = torch.rand(rays, samples, device=device, generator=generator)
-    return lower + share * (upper - lower)
+    return Depths.between(lower + share * (upper - lower))

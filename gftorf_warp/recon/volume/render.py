@@ -14,7 +14,7 @@ from ...scene.camera import Camera
 from ...scene.sensor import Sensor
 from . import composite
 from .composite import Samples
-from .rays import Views, z_depths
+from .rays import Views
 from .volume import Volume
 
 CHUNK = 1 << 18  # samples at a time: 0.3 GB of values of a layer of 256
@@ -46,8 +46,8 @@ def rendering_of(
     rows: list[dict[str, Tensor]] = []
     for first in range(0, views.pixels, step := max(1, CHUNK // count)):
         some = rays.part(slice(first, first + step))
-        z = z_depths(box.bounds, len(some.origin), count, volume.device)
-        rows.append(_images(volume.samples_at(time, some, z), sensor, colour=box.colour))
+        samples = volume.samples_at(time, some, volume.depths(some))
+        rows.append(_images(samples, sensor, colour=box.colour))
     images = {
         name: torch.cat([row[name] for row in rows], dim=-1).unflatten(-1, size) for name in rows[0]
     }
@@ -63,17 +63,13 @@ def rendering_of(
 def _images(samples: Samples, sensor: Sensor, *, colour: bool) -> dict[str, Float[Tensor, "*c R"]]:
     """Every image of some rays, by the names of ``Rendering``."""
     transmittance = samples.transmittance
-    mean, square = (
-        composite.expected(samples, transmittance, samples.distance**power) for power in (1, 2)
-    )
-    opacity = composite.expected(samples, transmittance, torch.ones_like(samples.alpha))
+    ones = torch.ones_like(samples.alpha)
     images = {
         "quads": composite.quads(samples, sensor, transmittance),
         "phasor": composite.phasor(samples, sensor, transmittance),
-        "distance": mean,
-        "opacity": opacity,
-        # of the double sum of w_k w_l (d_k - d_l)^2
-        "distortion": (2.0 * (opacity * square - mean.square())).clamp_min(0.0),
+        "distance": composite.expected(samples, transmittance, samples.distance),
+        "opacity": composite.expected(samples, transmittance, ones),
+        "distortion": composite.distortion(samples, transmittance),
         "distance_median": composite.median_distance(samples, transmittance),
     }
     return images | ({"colour": composite.colour(samples, transmittance)} if colour else {})

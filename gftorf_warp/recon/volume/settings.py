@@ -75,6 +75,67 @@ class SceneFlowSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GridSettings:
+    """The hash grids of method ``volume``, and which of its space is sampled. Level k of a grid has
+    ``coarsest * growth^k`` cells along every axis, rounded down.
+    """
+
+    levels: int = 12
+    """Levels of the grid that knows no time."""
+    moving_levels: int = 8
+    """Levels of the grid that every quartet has; its finest is that many levels up."""
+    flow_levels: int = 8
+    """Levels of the grid of the scene flow, which every quartet has."""
+    coarsest: int = 16
+    """Cells along an axis of the coarsest level; half of it for the scene flow."""
+    growth: float = 1.45
+    """Cells along an axis from one level to the next [1]."""
+    flow_growth: float = 1.3
+    """The same for the scene flow."""
+    rows_log2: int = 19
+    """Rows of a level at most, as a power of two; more vertices share them."""
+    width: int = 64
+    """Values of the layers of the networks."""
+    values: int = 16
+    """Values of a point from which its density and light follow."""
+    at_rest: float = 1e-2
+    """Weight of the mean squared feature of the grid that every quartet has: what rests is left to
+    the grid that knows no time."""
+    density: float = 0.3
+    """Density at the start [1/m]."""
+    occupancy: int = 128
+    """Cells along an axis of the grid that says where there is something."""
+    occupied: float = 3e-3
+    """Largest weight alpha T of late samples in a cell from which it counts as occupied [1]."""
+    kept: float = 0.8
+    """Share of that weight which is left at each update of the grid [1]."""
+    update_every: int = 32
+    """Steps between two updates."""
+    warm_up: int = 256
+    """Steps in which all of space is sampled alike."""
+    anywhere: float = 0.1
+    """Share of the samples of a ray that are placed without regard to it while training [1]."""
+    beside: int | None = 1
+    """Raw frames before the start of a quartet, and as many after it, that a step compares, at
+    random; None: all."""
+
+    def __post_init__(self):
+        for name in ("levels", "moving_levels", "flow_levels", "width", "update_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"grid.{name} must be at least 1, got {getattr(self, name)}")
+        if self.coarsest < 2 or self.occupancy < 2 or self.values < 2:
+            raise ValueError("grid.coarsest, grid.occupancy and grid.values must be at least 2")
+        if not (self.growth > 1 and self.flow_growth > 1 and self.density > 0):
+            raise ValueError("grid.growth and grid.flow_growth must exceed 1, grid.density 0")
+        if not (0 <= self.anywhere < 1 and 0 < self.kept < 1):
+            raise ValueError("grid.anywhere must be in [0, 1), grid.kept in (0, 1)")
+        if not 4 <= self.rows_log2 <= 24:
+            raise ValueError(f"grid.rows_log2 must be from 4 to 24, got {self.rows_log2}")
+        if self.beside is not None and self.beside < 1:
+            raise ValueError(f"grid.beside must be at least 1, got {self.beside}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class VolumeSettings:
     """A neural volume."""
 
@@ -82,6 +143,9 @@ class VolumeSettings:
     """Its networks."""
     scene_flow: SceneFlowSettings = field(default_factory=SceneFlowSettings)
     """How samples move between raw frames."""
+    grid: GridSettings | None = None
+    """Hash grids, of method ``volume``, which has only the direction of ``network``; None: of no
+    other."""
     rays: int = 256
     """Rays of a step, of random pixels of one raw frame."""
     accumulated: int = 4
@@ -101,6 +165,8 @@ class VolumeSettings:
     """Steps after which it is a tenth; the logarithm is linear."""
     gradient_max: float | None = 1.0
     """Each derivative is clipped to this; None: any."""
+    epsilon: float = 1e-7
+    """Of Adam, Keras' default: added to the root of the mean squared derivative."""
     quads_fall_at: int | None = None
     """From this step on the weight of quads or phasors is a tenth; None: never."""
     products: Products = Products.FLOAT32
@@ -132,6 +198,7 @@ def settings_of(stored: dict[str, Any]) -> VolumeSettings:
             "bounds": None if bounds is None else tuple(bounds),
             "network": NetworkSettings(**network),
             "scene_flow": SceneFlowSettings(**stored["scene_flow"]),
+            "grid": None if stored.get("grid") is None else GridSettings(**stored["grid"]),
             "products": Products(stored["products"]),
         }
     )

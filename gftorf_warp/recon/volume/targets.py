@@ -35,6 +35,27 @@ class Around:
     slope: Float[Tensor, "B 1 1"]
     """Their phases per distance [rad/m]."""
 
+    def some(self, count: int | None, draw: Draw) -> Around:
+        """The start and at most ``count`` raw frames in a row before it and after it, at random;
+        None: all.
+        """
+        b, a = len(self.before), len(self.after)
+        if count is None or (count >= b and count >= a):
+            return self
+        before, after = draw.part_of(b, count), draw.part_of(a, count)
+
+        def rows(values: Tensor) -> Tensor:
+            ahead, behind = values[1 : 1 + b], values[1 + b :]
+            return torch.cat([values[:1], ahead[before], behind[after]])
+
+        return Around(
+            frames=rows(self.frames),
+            before=self.before[before],
+            after=self.after[after],
+            shift=rows(self.shift),
+            slope=rows(self.slope),
+        )
+
 
 class Targets:
     """Measurements by pixel, numbered row by row, and the rays through them."""
@@ -137,6 +158,11 @@ class Draw:
     def one_of(self, choices: Sequence[T]) -> T:
         """One of them, all alike."""
         return choices[int(torch.randint(len(choices), (), generator=self.host))]
+
+    def part_of(self, length: int, count: int) -> slice:
+        """``count`` neighbours out of so many, or all if there are no more."""
+        first = int(torch.randint(max(1, length - count + 1), (), generator=self.host))
+        return slice(first, first + count)
 
     def pixels(self, count: int, of: int) -> Int[Tensor, "R"]:
         """Numbers of pixels."""

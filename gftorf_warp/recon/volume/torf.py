@@ -15,13 +15,12 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ..settings import Method, ReconSettings
 from . import composite
 from .composite import Samples
-from .rays import Rays, z_depths
+from .rays import Depths, Rays
 from .targets import Draw, Targets
 from .volume import Volume
 
@@ -81,14 +80,12 @@ class Torf(Volume):
 
     def _drawn(self, rays: Rays, quartet: int, draw: Draw, *, colour: bool = False) -> Samples:
         """Samples at random z-depths of their cells, with noise on their densities."""
-        count, samples = len(rays.origin), self.settings.samples
-        z = z_depths(self.box.bounds, count, samples, rays.origin.device, draw.device)
-        return self._blended(rays, z, quartet, draw, colour=colour)
+        return self._blended(rays, self.depths(rays, draw), quartet, draw, colour=colour)
 
     def _blended(
         self,
         rays: Rays,
-        z: Float[Tensor, "R S"],
+        depths: Depths,
         quartet: int,
         draw: Draw | None,
         *,
@@ -96,13 +93,15 @@ class Torf(Volume):
     ) -> Samples:
         """Samples of both networks as one."""
         assert self.resting is not None, "settings of method torf have network.static"
-        points = rays.at(z)
+        points = rays.at(depths.z)
         with self.precision():
             trunk = self.trunk(points[None], [quartet])[0]
             share = self.moving.blend(trunk)
-            moving = self.samples(trunk, rays, z, draw=draw, colour=colour)
+            moving = self.samples(trunk, rays, depths, draw=draw, colour=colour)
             trunk = self.resting.trunk(self.unit(points), None)
-            resting = self.samples(trunk, rays, z, draw=draw, colour=colour, network=self.resting)
+            resting = self.samples(
+                trunk, rays, depths, draw=draw, colour=colour, network=self.resting
+            )
 
         def mixed(rests: Tensor, moves: Tensor, share: Tensor) -> Tensor:
             return (1.0 - share) * rests + share * moves
@@ -117,9 +116,9 @@ class Torf(Volume):
             else mixed(both[0], both[1], share[..., None]),
         )
 
-    def samples_at(self, time: float, rays: Rays, z: Float[Tensor, "R S"]) -> Samples:
+    def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
         """Samples of the quartet whose middle is nearest to a time [s]."""
         half = 0.5 * self.box.period * (1.0 - 1.0 / self.box.cycle)
         middles = np.array(self.box.quartet_times)[self.box.quartets] + half
         quartet = self.box.quartets[int(np.abs(middles - time).argmin())]
-        return self._blended(rays, z, quartet, None, colour=self.box.colour)
+        return self._blended(rays, depths, quartet, None, colour=self.box.colour)

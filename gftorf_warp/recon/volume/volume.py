@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -15,8 +15,8 @@ from ...scene.motion import Products
 from ..settings import Method, ReconSettings
 from . import composite
 from .composite import Samples
-from .network import TimeCodes, VolumeNetwork
-from .rays import Rays
+from .network import Light, TimeCodes, VolumeNetwork
+from .rays import Depths, Rays, evenly
 from .settings import VolumeSettings
 from .targets import Draw, Targets
 
@@ -45,10 +45,22 @@ class Box:
     """Largest displacement within a quartet [m]: the unambiguous range."""
     colour: bool
     """Whether it has colour."""
+    spread: tuple[float, float] = (0.0, 0.0)
+    """Largest |x / z| and |y / z| in it [1], of a volume with grids."""
+
+
+class Field(Protocol):
+    """A network, as far as its samples are concerned."""
+
+    def density(self, trunk: Float[Tensor, "*n w"]) -> Float[Tensor, "*n"]:
+        """Density before its ReLU [1/m]."""
+
+    def light(self, trunk: Float[Tensor, "*b R S w"], direction: Float[Tensor, "R 3"]) -> Light:
+        """Light of samples of rays in directions of length 1."""
 
 
 class Volume(torch.nn.Module, abc.ABC):
-    """Networks in a box. Final classes: Torf, Ftorf."""
+    """Networks in a box. Final classes: Torf, Ftorf, GridVolume."""
 
     method: ClassVar[Method]
     faithful: ClassVar[tuple[str, ...]]
@@ -78,24 +90,27 @@ class Volume(torch.nn.Module, abc.ABC):
         self.settings, self.box = settings, box
         # an upload in every step would make a GPU wait
         self.register_buffer("axis_scale", torch.tensor(SCALED), persistent=False)
-        self.codes = TimeCodes(settings.network, box.frames, box.cycle, generator)
-        self.moving = VolumeNetwork(settings.network, self.codes.size, generator)
-        self.resting = (
-            VolumeNetwork(settings.network, 0, generator) if settings.network.static else None
-        )
+        self.build(generator)
+
+    def build(self, generator: torch.Generator) -> None:
+        """Create its networks with random weights."""
+        network, box = self.settings.network, self.box
+        self.codes = TimeCodes(network, box.frames, box.cycle, generator)
+        self.moving = VolumeNetwork(network, self.codes.size, generator)
+        self.resting = VolumeNetwork(network, 0, generator) if network.static else None
 
     @abc.abstractmethod
     def terms(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> dict:
         """Weighted terms of the loss of one step, and ``quad_mse``, the unweighted one."""
 
     @abc.abstractmethod
-    def samples_at(self, time: float, rays: Rays, z: Float[Tensor, "R S"]) -> Samples:
+    def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
         """Samples of rays at any time [s]."""
 
     @property
     def device(self) -> torch.device:
         """Where its parameters are."""
-        return self.moving.density_head.weight.device
+        return self.axis_scale.device
 
     def precision(self) -> torch.autocast:
         """Context of all products of the networks."""
@@ -106,6 +121,11 @@ class Volume(torch.nn.Module, abc.ABC):
         """Points [m] in the units of the networks."""
         near, far = self.box.bounds
         return 2.0 * (points * (self.axis_scale / (far - near)) - 0.5)
+
+    def depths(self, rays: Rays, draw: Draw | None = None) -> Depths:
+        """Where the samples of rays are; at random within their cells if numbers are drawn."""
+        random, count = None if draw is None else draw.device, self.settings.samples
+        return evenly(self.box.bounds, len(rays.origin), count, rays.origin.device, random)
 
     def trunk(
         self, points: Float[Tensor, "T R S 3"], quartets: list[int]
@@ -118,29 +138,29 @@ class Volume(torch.nn.Module, abc.ABC):
         self,
         trunk: Float[Tensor, "*b R S w"],
         rays: Rays,
-        z: Float[Tensor, "R S"],
+        depths: Depths,
         *,
         draw: Draw | None = None,
         colour: bool = False,
-        network: VolumeNetwork | None = None,
+        network: Field | None = None,
     ) -> Samples:
         """What a network puts on rays.
 
         Args:
             trunk: Its values at the points of the samples, perhaps several for each.
             rays: The rays.
-            z: z-depths of the samples [m].
+            depths: Where the samples are.
             draw: Adds noise to densities; None: none.
             colour: Whether colour is wanted.
             network: Whose values these are; None: of the one that moves.
         """
-        network = network or self.moving
+        network = self.moving if network is None else network
         length = rays.length
-        distance = z * length[:, None]
+        distance = depths.z * length[:, None]
         raw = network.density(trunk)
-        if draw is not None:
+        if draw is not None and self.settings.density_noise > 0:
             raw = raw + draw.noise(raw, self.settings.density_noise)
-        alpha = composite.opacities(raw, z, length)
+        alpha = composite.opacities(raw, depths.interval, length)
         light = network.light(trunk, rays.direction / length[:, None])
         strength = alpha * light.reflectivity * self.settings.falloff / distance.square()
         return Samples(
@@ -160,8 +180,12 @@ def box_of(targets: Targets, settings: VolumeSettings) -> Box:
     """Where the volume of a recording is."""
     sequence, times = targets.observations.sequence, targets.quartet_times
     period = times[1] - times[0] if len(times) > 1 else float(np.ptp(sequence.times)) or 1.0
+    bounds = settings.bounds or targets.bounds()
+    views = [targets.views] + ([] if targets.colour_views is None else [targets.colour_views])
+    spreads = [(0.0, 0.0)] if settings.grid is None else [each.spread(bounds) for each in views]
     return Box(
-        bounds=settings.bounds or targets.bounds(),
+        bounds=bounds,
+        spread=(max(x for x, _ in spreads), max(y for _, y in spreads)),
         volume_from_world=targets.volume_from_world.tolist(),
         quartet_times=times,
         quartets=sequence.complete_quartets,
