@@ -7,8 +7,8 @@
 Without a sequence, 60 raw frames of ``sliding_cube`` are simulated. Each row times N steps, updates
 of Adam included, after a warm-up of a tenth as many: for ``ftorf`` and ``volume`` those in which a
 quartet is simultaneous and those with scene flow, for ``torf`` all alike. ``whole run``
-extrapolates to the steps of the preset; ``image`` is the rendering of one raw frame at the size of the sequence.
-With ``--profile`` what ran longest in ten steps is listed under every row.
+extrapolates to the steps of the preset; ``image`` is the rendering of one raw frame at the size of
+the sequence. With ``--profile`` what ran longest in ten steps is listed under every row.
 """
 
 from __future__ import annotations

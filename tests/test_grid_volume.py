@@ -14,12 +14,13 @@ from gftorf_warp.recon.volume import composite
 from gftorf_warp.recon.volume.models import new_volume
 from gftorf_warp.recon.volume.occupancy import Occupancy
 from gftorf_warp.recon.volume.rays import CLOSED
-from gftorf_warp.recon.volume.settings import GridSettings
+from gftorf_warp.recon.volume.settings import GridSettings, OccupancySettings
 from gftorf_warp.recon.volume.targets import Draw, Targets
 
+CELLS = OccupancySettings(cells=10, update_every=1, warm_up=0, anywhere=0.2)
 GRID = GridSettings(
     levels=3, moving_levels=2, flow_levels=2, rows_log2=8, coarsest=4, width=8, values=4,
-    occupancy=10, update_every=1, warm_up=0, anywhere=0.2,
+    occupancy=CELLS,
 )  # fmt: skip
 BOUNDS = (1.0, 6.0)
 
@@ -39,7 +40,7 @@ def middles(rays=4):
 
 def occupied(*cells):
     """A grid in which these cells along z, of one column, are occupied."""
-    found = Occupancy(GRID)
+    found = Occupancy(CELLS)
     found.occupied.zero_()
     for z in cells:
         found.occupied[z, 7, 3] = 1.0
@@ -79,14 +80,14 @@ def test_a_ray_through_nothing_is_sampled_evenly():
     """As at the start of a run, when everything counts as occupied."""
     empty = occupied().depths(middles(), BOUNDS, 10)
     assert_close(empty.z[0], 1.25 + 0.5 * torch.arange(10.0))
-    assert_close(Occupancy(GRID).depths(middles(), BOUNDS, 10).z, empty.z)
+    assert_close(Occupancy(CELLS).depths(middles(), BOUNDS, 10).z, empty.z)
 
 
 def test_what_was_seen_lately_is_occupied():
     """A cell and its neighbours, until its weight has decayed; other cells as soon as nothing is
     seen there.
     """
-    found = Occupancy(GRID)
+    found = Occupancy(CELLS)
     point = torch.tensor([[[0.55, 0.55, 0.55]]])
     for step in range(60):
         found.note(point, torch.tensor([[[0.0]], [[0.5]]]), step)
@@ -168,13 +169,20 @@ def test_the_distortion_of_a_ray():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("levels", 0), ("coarsest", 1), ("growth", 1.0), ("anywhere", 1.0), ("rows_log2", 30),
+    [("levels", 0), ("coarsest", 1), ("growth", 1.0), ("rows_log2", 30),
      ("beside", 0)],
 )  # fmt: skip
 def test_impossible_grids_are_refused(name, value):
     """By name."""
     with pytest.raises(ValueError, match=name):
         replace(GRID, **{name: value})
+
+
+@pytest.mark.parametrize(("name", "value"), [("cells", 1), ("anywhere", 1.0), ("kept", 0.0)])
+def test_impossible_occupancies_are_refused(name, value):
+    """By name."""
+    with pytest.raises(ValueError, match=name):
+        replace(CELLS, **{name: value})
 
 
 def test_its_quads_move_with_time():

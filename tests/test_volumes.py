@@ -49,8 +49,8 @@ def toy(name, images=40, **changes):
     grid = settings.volume.grid
     if grid is not None:
         levels = {"levels": 4, "moving_levels": 3, "flow_levels": 2, "rows_log2": 10}
-        often = {"update_every": 4, "warm_up": 20}
-        grid = replace(grid, **levels, **often, coarsest=4, width=16, values=8, occupancy=16)
+        occupancy = replace(grid.occupancy, cells=16, update_every=4, warm_up=20)
+        grid = replace(grid, **levels, coarsest=4, width=16, values=8, occupancy=occupancy)
     volume = replace(settings.volume, network=network, grid=grid, samples=16, rays=48)
     volume = replace(volume, accumulated=1, rate=5e-3, **changes)
     schedule = replace(settings.schedule, images=images, log_every=10)

@@ -43,9 +43,8 @@ def levels_of(cells: list[int], times: int, rows_max: int) -> tuple[Levels, int]
         raise ValueError(f"rows_max must be a power of two, got {rows_max}")
     rows = [min((n + 1) ** 3 * times, rows_max) for n in cells]
     starts = [sum(rows[:k]) for k in range(len(rows))]
-    return Levels(*(torch.tensor(v, dtype=torch.int32) for v in (cells, starts, rows)), times), sum(
-        rows
-    )
+    r, n, s = (torch.tensor(each, dtype=torch.int32) for each in (cells, rows, starts))
+    return Levels(cells=r, starts=s, rows=n, times=times), sum(rows)
 
 
 def interpolated(

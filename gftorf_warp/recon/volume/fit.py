@@ -54,7 +54,8 @@ def describe(settings: ReconSettings, changes: Iterable[str]) -> dict[str, Any]:
         changes: Settings that were changed by name, which makes them differ from published ones.
     """
     kind, steps = VOLUMES[settings.method], settings.schedule.images
-    changed = list(changes) + ([f"{steps} steps"] if steps != PUBLISHED_STEPS else [])
+    shortened = bool(kind.faithful) and steps != PUBLISHED_STEPS
+    changed = list(changes) + ([f"{steps} steps"] if shortened else [])
     assumed = list(kind.assumed) + ([f"changed: {', '.join(changed)}"] if changed else [])
     for sentence in kind.faithful:
         LOG.info("%s, as published: %s", settings.method, sentence)

@@ -48,13 +48,13 @@ class Ftorf(Volume):
     """A volume that moves between quartets."""
 
     method = Method.FTORF
-    faithful: ClassVar = (
+    faithful: ClassVar[tuple[str, ...]] = (
         "network, encodings, positional time code, samples, compositing, 256 rays in 4 "
         "accumulated steps, Adam at 2e-4 clipped by value",
         "raw quads at their own times (weight 10), 3D flow of a cycle, its three regularisers, "
         "25,000 of 400,000 steps in which a quartet is simultaneous",
     )
-    assumed: ClassVar = (
+    assumed: ClassVar[tuple[str, ...]] = (
         "settings of the published synthetic table are not published (the released script for "
         "synthetic scenes never leaves its first stage and fits phasors): these are those of the "
         "real scenes with the DC offset of the recording",
@@ -77,7 +77,7 @@ class Ftorf(Volume):
                 trunk = self.trunk(points[None], [quartet])
                 samples = self.samples(trunk, rays, depths, draw=draw)
             around = targets.around(quartet, after_only=True)
-            mse = self._errors(targets, around, samples, pixels).mean()
+            mse = _errors(targets, around, samples, pixels).mean()
             more = self.more_terms(rays, depths, samples, step, settings)
             return {"quads": weight * mse, "quad_mse": mse.detach()} | more
         every = targets.around(quartet)
@@ -86,7 +86,7 @@ class Ftorf(Volume):
             own, flows = self._quartet(quartet, points)
             beside, gap = self._beside(around, quartet, points, flows)
             samples = self.samples(torch.cat([own, beside]), rays, depths, draw=draw)
-        errors = self._errors(targets, around, samples, pixels)
+        errors = _errors(targets, around, samples, pixels)
         larger = (len(every.frames) - 1) / max(1, len(around.frames) - 1)
         kept = max(1, round(options.kinetic_share * depths.z.shape[1]))
         both = (flows.forward + flows.backward)[:, :kept]
@@ -100,8 +100,9 @@ class Ftorf(Volume):
         weight = settings.weights.flow * max(0.0, 1.0 - step / options.vanishes_at)
         if weight > 0 and quartet in targets.flow_rows:
             measured = targets.flow[targets.flow_rows[quartet]][..., pixels]
+            nearest = 0.5 * self.box.bounds[0]
             seen = rays.at((_weights(samples)[0] * depths.z).sum(dim=-1))
-            terms["flow"] = weight * self._projected(targets, measured, samples, seen, flows)
+            terms["flow"] = weight * _projected(targets, measured, samples, seen, flows, nearest)
         return terms | self.more_terms(rays, depths, samples, step, settings)
 
     def compared(self, around: Around, draw: Draw) -> Around:  # noqa: ARG002
@@ -171,36 +172,6 @@ class Ftorf(Volume):
         ]
         return beside, torch.stack(gaps).sum() if gaps else points.new_zeros(())
 
-    def _errors(
-        self, targets: Targets, around: Around, samples: Samples, pixels: Int[Tensor, "R"]
-    ) -> Float[Tensor, "B"]:
-        """Mean squared error of the slot that each raw frame measured [optimised units^2]."""
-        sensor = targets.observations.sensor
-        passed = samples.transmittance
-        found = composite.modulated(samples, sensor, passed, around.shift, around.slope)
-        measured = targets.quads[around.frames][:, pixels]
-        return (found - measured).square().mean(dim=1)
-
-    def _projected(
-        self,
-        targets: Targets,
-        measured: Float[Tensor, "2 2 R"],
-        samples: Samples,
-        seen: Float[Tensor, "R 3"],
-        flows: Neighbours,
-    ) -> Tensor:
-        """Mean absolute difference to the optical flow of a quartet start [px], where known; the
-        first of the samples are those of the start.
-        """
-        weight, nearest = _weights(samples)[0], 0.5 * self.box.bounds[0]
-        start, known = _image(targets, seen, nearest), measured.isfinite()
-        gaps = []
-        for direction, flow in ((FORWARD, flows.forward), (BACKWARD, flows.backward)):
-            moved = seen + (weight[..., None] * flow).sum(dim=1)
-            apart = (_image(targets, moved, nearest) - start).T - measured[direction]
-            gaps.append(torch.where(known[direction], apart, torch.zeros_like(apart)).abs().sum())
-        return torch.stack(gaps).sum() / known.sum().clamp_min(1)
-
     def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
         """Samples moved from the nearest quartet start to a time [s]."""
         starts = np.array(self.box.quartet_times)[self.box.quartets]
@@ -217,6 +188,38 @@ class Ftorf(Volume):
                 _, flow = self.values_and_flow(points[None], [source], nothing, all_rows)
                 points = points + abs(share) * flow[0, ..., BACKWARD if share > 0 else FORWARD, :]
             return self.samples(self.trunk(points[None], [quartet])[0], rays, depths)
+
+
+def _errors(
+    targets: Targets, around: Around, samples: Samples, pixels: Int[Tensor, "R"]
+) -> Float[Tensor, "B"]:
+    """Mean squared error of the slot that each raw frame measured [optimised units^2]."""
+    sensor = targets.observations.sensor
+    passed = samples.transmittance
+    found = composite.modulated(samples, sensor, passed, around.shift, around.slope)
+    measured = targets.quads[around.frames][:, pixels]
+    return (found - measured).square().mean(dim=1)
+
+
+def _projected(
+    targets: Targets,
+    measured: Float[Tensor, "2 2 R"],
+    samples: Samples,
+    seen: Float[Tensor, "R 3"],
+    flows: Neighbours,
+    nearest: float,
+) -> Tensor:
+    """Mean absolute difference to the optical flow of a quartet start [px], where known; the
+    first of the samples are those of the start, and nothing is nearer than ``nearest`` [m].
+    """
+    weight = _weights(samples)[0]
+    start, known = _image(targets, seen, nearest), measured.isfinite()
+    gaps = []
+    for direction, flow in ((FORWARD, flows.forward), (BACKWARD, flows.backward)):
+        moved = seen + (weight[..., None] * flow).sum(dim=1)
+        apart = (_image(targets, moved, nearest) - start).T - measured[direction]
+        gaps.append(torch.where(known[direction], apart, torch.zeros_like(apart)).abs().sum())
+    return torch.stack(gaps).sum() / known.sum().clamp_min(1)
 
 
 def _weights(samples: Samples) -> Float[Tensor, "*b R S"]:

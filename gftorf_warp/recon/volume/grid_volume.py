@@ -38,8 +38,8 @@ class GridVolume(Ftorf):
     """A volume of hash grids that moves between quartets."""
 
     method = Method.VOLUME
-    faithful: ClassVar = ()
-    assumed: ClassVar = (
+    faithful: ClassVar[tuple[str, ...]] = ()
+    assumed: ClassVar[tuple[str, ...]] = (
         "a neural volume of our own, after no publication; losses and scene flow are those of "
         "ftorf",
         "hash grids and small layers, samples where there is something: not the networks of TöRF "
@@ -56,7 +56,7 @@ class GridVolume(Ftorf):
         quartets = len(self.box.quartet_times)
         octaves = self.settings.network.direction_octaves
         self.field = GridNetwork(self.grid, quartets, octaves, generator)
-        self.occupancy = Occupancy(self.grid)
+        self.occupancy = Occupancy(self.grid.occupancy)
         # uploads in every step would make a GPU wait
         numbers = torch.arange(quartets, dtype=torch.int32)
         self.register_buffer("numbers", numbers, persistent=False)
@@ -79,7 +79,8 @@ class GridVolume(Ftorf):
     def depths(self, rays: Rays, draw: Draw | None = None) -> Depths:
         """Samples where there is something."""
         near, far = self.box.bounds
-        count, half = self.grid.occupancy, 0.5 * (far - near) / self.grid.occupancy
+        count = self.grid.occupancy.cells
+        half = 0.5 * (far - near) / count
         middles = torch.linspace(near + half, far - half, count, device=rays.origin.device)
         z = middles.expand(len(rays.origin), count)
         random = None if draw is None else draw.device

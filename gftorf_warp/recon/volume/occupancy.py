@@ -7,7 +7,8 @@ with B equal intervals of z-depth, samples are at the quantiles (k + u) / S of
     p = (1 - e) m / sum(m) + e / B,   m = 1 in occupied intervals and 0 elsewhere
 
 and each stands for an interval of depth (far - near) / (B S p). So empty space costs no samples,
-and a wrong guess stays visible to the share e of them. A ray without an occupied interval has m = 1.
+and a wrong guess stays visible to the share e of them. A ray without an occupied interval has m =
+1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .rays import CLOSED, Depths
-from .settings import GridSettings
+from .settings import OccupancySettings
 
 
 class Occupancy(torch.nn.Module):
@@ -29,11 +30,11 @@ class Occupancy(torch.nn.Module):
     occupied: Float[Tensor, "c c c"]
     """1 where samples are placed, else 0."""
 
-    def __init__(self, settings: GridSettings):
+    def __init__(self, settings: OccupancySettings):
         """Begin with all cells occupied."""
         super().__init__()
         self.settings = settings
-        shape = [settings.occupancy] * 3
+        shape = [settings.cells] * 3
         self.register_buffer("seen", torch.ones(shape))
         self.register_buffer("occupied", torch.ones(shape))
 
@@ -48,7 +49,7 @@ class Occupancy(torch.nn.Module):
         if (step + 1) % self.settings.update_every == 0:
             if step >= self.settings.warm_up:
                 spread = functional.max_pool3d(self.seen[None], 3, stride=1, padding=1)[0]
-                self.occupied.copy_(spread > self.settings.occupied)
+                self.occupied.copy_(spread > self.settings.least)
             self.seen.mul_(self.settings.kept)
 
     @torch.no_grad()
@@ -93,6 +94,6 @@ class Occupancy(torch.nn.Module):
 
     def _cells(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Numbers of the cells of points in the unit cube."""
-        count = self.settings.occupancy
+        count = self.settings.cells
         x, y, z = (points * count).long().clamp_(0, count - 1).unbind(-1)
         return (z * count + y) * count + x

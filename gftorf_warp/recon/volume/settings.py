@@ -75,8 +75,32 @@ class SceneFlowSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OccupancySettings:
+    """Which of its space method ``volume`` samples."""
+
+    cells: int = 128
+    """Cells along an axis of the grid that says where there is something."""
+    least: float = 3e-3
+    """Largest weight alpha T of late samples in a cell from which it counts as occupied [1]."""
+    kept: float = 0.8
+    """Share of that weight which is left at each update of the grid [1]."""
+    update_every: int = 32
+    """Steps between two updates."""
+    warm_up: int = 256
+    """Steps in which all of space is sampled alike."""
+    anywhere: float = 0.1
+    """Share of the samples of a ray that are placed without regard to it while training [1]."""
+
+    def __post_init__(self):
+        if self.cells < 2 or self.update_every < 1:
+            raise ValueError("occupancy.cells must be at least 2, occupancy.update_every 1")
+        if not (0 <= self.anywhere < 1 and 0 < self.kept < 1):
+            raise ValueError("occupancy.anywhere must be in [0, 1), occupancy.kept in (0, 1)")
+
+
+@dataclass(frozen=True, kw_only=True)
 class GridSettings:
-    """The hash grids of method ``volume``, and which of its space is sampled. Level k of a grid has
+    """The hash grids of method ``volume``. Level k of a grid has
     ``coarsest * growth^k`` cells along every axis, rounded down.
     """
 
@@ -103,32 +127,20 @@ class GridSettings:
     the grid that knows no time."""
     density: float = 0.3
     """Density at the start [1/m]."""
-    occupancy: int = 128
-    """Cells along an axis of the grid that says where there is something."""
-    occupied: float = 3e-3
-    """Largest weight alpha T of late samples in a cell from which it counts as occupied [1]."""
-    kept: float = 0.8
-    """Share of that weight which is left at each update of the grid [1]."""
-    update_every: int = 32
-    """Steps between two updates."""
-    warm_up: int = 256
-    """Steps in which all of space is sampled alike."""
-    anywhere: float = 0.1
-    """Share of the samples of a ray that are placed without regard to it while training [1]."""
+    occupancy: OccupancySettings = field(default_factory=OccupancySettings)
+    """Where samples are."""
     beside: int | None = 1
     """Raw frames before the start of a quartet, and as many after it, that a step compares, at
     random; None: all."""
 
     def __post_init__(self):
-        for name in ("levels", "moving_levels", "flow_levels", "width", "update_every"):
+        for name in ("levels", "moving_levels", "flow_levels", "width"):
             if getattr(self, name) < 1:
                 raise ValueError(f"grid.{name} must be at least 1, got {getattr(self, name)}")
-        if self.coarsest < 2 or self.occupancy < 2 or self.values < 2:
-            raise ValueError("grid.coarsest, grid.occupancy and grid.values must be at least 2")
+        if self.coarsest < 2 or self.values < 2:
+            raise ValueError("grid.coarsest and grid.values must be at least 2")
         if not (self.growth > 1 and self.flow_growth > 1 and self.density > 0):
             raise ValueError("grid.growth and grid.flow_growth must exceed 1, grid.density 0")
-        if not (0 <= self.anywhere < 1 and 0 < self.kept < 1):
-            raise ValueError("grid.anywhere must be in [0, 1), grid.kept in (0, 1)")
         if not 4 <= self.rows_log2 <= 24:
             raise ValueError(f"grid.rows_log2 must be from 4 to 24, got {self.rows_log2}")
         if self.beside is not None and self.beside < 1:
@@ -198,7 +210,13 @@ def settings_of(stored: dict[str, Any]) -> VolumeSettings:
             "bounds": None if bounds is None else tuple(bounds),
             "network": NetworkSettings(**network),
             "scene_flow": SceneFlowSettings(**stored["scene_flow"]),
-            "grid": None if stored.get("grid") is None else GridSettings(**stored["grid"]),
+            "grid": _grid_of(stored.get("grid")),
             "products": Products(stored["products"]),
         }
     )
+
+
+def _grid_of(stored: dict[str, Any] | None) -> GridSettings | None:
+    if stored is None:
+        return None
+    return GridSettings(**stored | {"occupancy": OccupancySettings(**stored["occupancy"])})

@@ -31,11 +31,11 @@ class Torf(Volume):
     """A volume with a part that rests and a part that moves from quartet to quartet."""
 
     method = Method.TORF
-    faithful: ClassVar = (
+    faithful: ClassVar[tuple[str, ...]] = (
         "networks, encodings, time codes, 128 samples, compositing, 1,024 rays per step",
         "phasor (weight 8, 0.8 from step 125,000) and colour (weight 2) in turn, Adam at 1e-3",
     )
-    assumed: ClassVar = (
+    assumed: ClassVar[tuple[str, ...]] = (
         "poses are those of the recording; published real scenes optimise theirs",
         "bounds of the rays are from decoded distances; published ones were chosen per scene",
         "the blend has its factor b also in front of what moves, which the release leaves out",
