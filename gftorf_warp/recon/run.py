@@ -16,5 +16,6 @@ KINDS |= {
     Method.FLOW2D: Flow2D,
     Method.TORF: VolumeRun,
     Method.FTORF: VolumeRun,
+    Method.VOLUME: VolumeRun,
     "windows": WindowedRun,
 }

@@ -72,7 +72,7 @@ class Occupancy(torch.nn.Module):
         mass = self.occupied.view(-1)[self._cells(intervals)]
         total = mass.sum(dim=-1, keepdim=True)
         nothing = total == 0
-        share = torch.where(nothing, 1.0, mass) / torch.where(nothing, float(count), total)
+        share = mass.masked_fill(nothing, 1.0) / total.masked_fill(nothing, float(count))
         if generator is not None:
             share = (1.0 - self.settings.anywhere) * share + self.settings.anywhere / count
         edges = functional.pad(torch.cumsum(share, dim=-1), (1, 0))
@@ -89,7 +89,7 @@ class Occupancy(torch.nn.Module):
         step = (bounds[1] - bounds[0]) / count
         within = ((wanted - edges.gather(1, found)) / here).clamp(0.0, 1.0)
         interval = step / (samples * here)
-        interval[:, -1] = CLOSED
+        interval[:, -1].fill_(CLOSED)
         return Depths(z=bounds[0] + step * (found + within), interval=interval)
 
     def _cells(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
