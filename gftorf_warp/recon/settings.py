@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.flow import Method as Matcher
@@ -337,14 +338,15 @@ class ReconSettings:
 
 def plain(settings: ReconSettings) -> dict[str, object]:
     """Settings as nested dictionaries of numbers, texts and None, as config.json holds them."""
+    converted: dict[str, object] = _converted(dataclasses.asdict(settings))
+    return converted
 
-    def convert(value):
-        if isinstance(value, dict):
-            return {key: convert(item) for key, item in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [convert(item) for item in value]
-        if isinstance(value, float) and value in (float("inf"), float("-inf")):
-            return str(value)
-        return str(value) if isinstance(value, enum.Enum) else value
 
-    return convert(dataclasses.asdict(settings))
+def _converted(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _converted(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_converted(item) for item in value]
+    if isinstance(value, float) and value in (float("inf"), float("-inf")):
+        return str(value)
+    return str(value) if isinstance(value, enum.Enum) else value

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -80,7 +81,7 @@ class Stepper:
             limited=self._padded.pads,
             waits=settings.render.deterministic,
         )
-        self._graphs: dict[GraphKey, Callable[[], None]] = {}
+        self._graphs: dict[GraphKey, tuple[descent.AdamTable, CapturedGraph | None]] = {}
         self._key: GraphKey | None = None  # of the last step
         self._steps = 0  # since the last :meth:`_attach`
         self._pool = graph_pool(device)
@@ -123,7 +124,11 @@ class Stepper:
     def _run(self, key: GraphKey) -> None:
         """Launch a step; the first one of a key is not captured, since it loads modules."""
         if key in self._graphs:
-            self._graphs[key]()
+            table, graph = self._graphs[key]
+            if graph is None:
+                self._launch(key, table, table.send, self._map_images)
+            else:
+                graph(lambda: self._launch(key, table, None, map))
             if self._counts.is_nearly_full():
                 self._read_counts()
             return
@@ -132,7 +137,8 @@ class Stepper:
         self._launch(key, table, table.send, map)  # one thread: kernels are compiled now
         if not self._counts.has_capacity:
             self._read_counts()
-        self._graphs[key] = self._captured(key, table)
+        captured = self._padded.pads and self.settings.graph
+        self._graphs[key] = table, graph_of(table, self._pool) if captured else None
 
     def _launch(
         self, key: GraphKey, table: descent.AdamTable, send: Send | None, map_images: Map
@@ -141,20 +147,6 @@ class Stepper:
             self.settings.render, sh_degree=key.sh_degree, pair_capacity=self._counts.capacity
         )
         self._step.run(key, self.state.motion, render, table, send, map_images)
-
-    def _captured(self, key: GraphKey, table: descent.AdamTable) -> Callable[[], None]:
-        """A step of this key as a function: a CUDA graph on a GPU,
-        unless the settings say otherwise.
-        """
-        if not (self._padded.pads and self.settings.graph):
-            return lambda: self._launch(key, table, table.send, self._map_images)
-
-        def ready() -> None:  # gradients have the addresses that the capture gave them
-            table.send()
-            table.release()
-
-        device = self.observations.quads.device
-        return CapturedGraph(lambda: self._launch(key, table, None, map), device, ready, self._pool)
 
     def _enter(self, key: GraphKey) -> None:
         """Release the graphs of a stage that is over; prepare the one that begins."""
@@ -191,6 +183,16 @@ class Stepper:
         if changed:
             self._release_graphs()
         return in_a_row
+
+
+def graph_of(table: descent.AdamTable, pool: Any) -> CapturedGraph:
+    """The graph of a step whose parameters are in ``table``, to be captured."""
+
+    def ready() -> None:  # gradients have the addresses that the capture gave them
+        table.send()
+        table.release()
+
+    return CapturedGraph(ready, pool)
 
 
 def rates_of(

@@ -106,39 +106,29 @@ def graph_pool(device: torch.device) -> Any:
 
 
 class CapturedGraph:
-    """A function as a CUDA graph, captured at the first call and replayed; on a CPU it is called.
+    """A CUDA graph of a function, captured at the first call and replayed.
 
-    It must not synchronise, and what it reads and writes must keep its addresses. What it allocates
-    is valid until the next graph of its pool is replayed.
+    The function must not synchronise, and what it reads and writes must keep its addresses. What it
+    allocates is valid until the next graph of its pool is replayed. It is an argument of every
+    call, not kept: an object that keeps its graph would otherwise refer to itself.
     """
 
-    def __init__(
-        self,
-        work: Callable[[], None],
-        device: torch.device,
-        ready: Callable[[], None] | None = None,
-        pool: Any = None,
-    ):
-        """Wrap ``work``.
+    def __init__(self, ready: Callable[[], None] | None = None, pool: Any = None):
+        """Nothing is captured yet.
 
         Args:
-            work: What is captured.
-            device: Where it runs.
             ready: Called between the capture and the first replay.
             pool: Memory shared with other graphs, see :func:`graph_pool`; None: its own.
         """
-        self._work, self._device, self._ready, self._pool = work, device, ready, pool
+        self._ready, self._pool = ready, pool
         self._graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self) -> None:
-        """Run it."""
-        if self._device.type == "cpu":
-            self._work()
-            return
+    def __call__(self, work: Callable[[], None]) -> None:
+        """Replay the graph of ``work``, the same in all calls; the first one captures it."""
         if self._graph is None:
             graph = torch.cuda.CUDAGraph()
             with capture(graph, pool=self._pool):
-                self._work()
+                work()
             self._graph = graph
             if self._ready is not None:
                 self._ready()
