@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 from . import __version__
-from .errors import UsageError
+from .errors import UsageError, did_you_mean
 
 FRESH = "start over in a folder that is not empty"
 MOVED = "where the sequence of the run is now, if it was moved; RUN remembers it"
@@ -69,7 +68,7 @@ class Parser(argparse.ArgumentParser):
                 f"unknown {kind} {name}",
                 where=self.prog,
                 why=f"`{self.prog}` has no such {kind}",
-                fix=nearest(name, list(self._option_string_actions), f"see `{self.prog} --help`"),
+                fix=did_you_mean(name, self._option_string_actions, f"see `{self.prog} --help`"),
             )
         return values
 
@@ -89,7 +88,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         why = f"one of {', '.join(parsers)} is needed"
         raise UsageError("no command", where="gftorf", why=why, fix="gftorf --help")
     if command not in parsers:
-        hint = nearest(command, list(parsers), "see `gftorf --help`")
+        hint = did_you_mean(command, parsers, "see `gftorf --help`")
         why = f"there are {', '.join(parsers)}"
         raise UsageError(f"unknown command {command}", where="gftorf", why=why, fix=hint)
     rest = list(arguments)
@@ -387,9 +386,3 @@ def _rate(text: str) -> float:
 
 def _list_of(item: Callable[[str], object]) -> Callable[[str], list]:
     return lambda text: [item(part) for part in text.split(",")]
-
-
-def nearest(name: str, names: list[str], otherwise: str) -> str:
-    """A hint: the most similar of ``names``, else ``otherwise``."""
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]}?" if close else otherwise

@@ -19,6 +19,7 @@ import soak
 
 
 def test_a_finished_run_leaves_no_tensors_to_the_garbage_collector(tmp_path):
+    """Nor the stepper, which holds the padded parameters and all images of a run."""
     sequence = simulate("demo", tmp_path / "seq", size=(32, 24), frames=8)
     compare(reconstruct(sequence, tmp_path / "first", "demo", images=16))  # fills caches
     gc.collect()
@@ -40,7 +41,7 @@ KEPT = (torch.Tensor, Stepper)
 
 def states(count=20, **values):
     """States of so many rounds, constant but for functions of the round."""
-    usual = dict.fromkeys([*soak.MEMORY, *soak.NUMBERS], lambda n: 100)
+    usual = dict.fromkeys([*soak.MEMORY, *soak.NUMBERS], lambda _: 100)
     made = []
     for n in range(count):
         found = {name: value(n) for name, value in (usual | values).items()}
@@ -49,12 +50,15 @@ def states(count=20, **values):
 
 
 def test_slope_of_a_line_with_noise():
+    """The textbook's formulas, by hand: residuals -0.2, 0.6, -0.6, 0.2."""
     steep, error = soak.slope([0, 1, 2, 3], [1, 3, 3, 5])
     assert steep == pytest.approx(1.2)
     assert error == pytest.approx((0.8 / 2 / 5) ** 0.5)
 
 
 def test_growth_is_found_and_noise_is_not():
+    """Memory by its slope, numbers by the last tenth of the rounds."""
+
     def noise(n):
         return 100 + 3 * (n % 3)
 
@@ -69,6 +73,7 @@ def test_growth_is_found_and_noise_is_not():
 
 
 def test_a_round_leaves_no_file(tmp_path, monkeypatch):
+    """Neither in TMPDIR nor in the working folder, nor in that of the caller."""
     monkeypatch.setattr(soak, "PRESETS", ("temporal",))
     before = set(Path.cwd().iterdir())
     found = soak.rounds(1.0, 2, tmp_path / "table.csv")

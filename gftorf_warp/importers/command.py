@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import shutil
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from ..data.sequence import Sequence
 from ..data.untrusted import read_text
 from ..data.write import write
 from ..data.writing import refuse_inexpressible
-from ..errors import InputError, UsageError
+from ..errors import InputError, UsageError, did_you_mean
 from .imported import Imported
 from .keys import load, template
 from .kinds import KINDS, Kind
@@ -30,8 +29,7 @@ def kind_of(name: str) -> Kind:
         UsageError: If there is none.
     """
     if name not in KINDS:
-        close = difflib.get_close_matches(name, KINDS, n=1)
-        fix = f"did you mean {close[0]}?" if close else "gftorf import --list"
+        fix = did_you_mean(name, KINDS, "gftorf import --list")
         why = f"there are {', '.join(KINDS)}"
         raise UsageError(f"unknown kind {name}", where="gftorf import", why=why, fix=fix)
     return KINDS[name]

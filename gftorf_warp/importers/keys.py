@@ -6,7 +6,6 @@ by name, and a commented template is written from them.
 
 from __future__ import annotations
 
-import difflib
 import math
 import textwrap
 from collections.abc import Iterable, Mapping
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data.texts import read_toml
-from ..errors import InputError, UsageError
+from ..errors import InputError, UsageError, did_you_mean, similar
 
 CONFIG = "--config"
 WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
@@ -188,9 +187,8 @@ def _flattened(
 def _unknown(path: Path, name: str, known: list[str]) -> InputError:
     last = name.rpartition(".")[2]
     others = {other.rpartition(".")[2]: other for other in known}  # right key, wrong table
-    close = difflib.get_close_matches(name, known, n=1)
-    close = close or [others[n] for n in difflib.get_close_matches(last, list(others), n=1)]
-    fix = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    close = similar(name, known) or others.get(similar(last, others) or "", "")
+    fix = did_you_mean(close, known, f"there are {', '.join(known)}")
     what = f"unknown key {name}"
     return InputError(what, where=path, why="this kind of import has no such key", fix=fix)
 

@@ -6,7 +6,6 @@ tuples.
 
 from __future__ import annotations
 
-import difflib
 import enum
 import math
 import types
@@ -15,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, Union
 
-from ..errors import UsageError
+from ..errors import UsageError, did_you_mean
 
 Settings = TypeVar("Settings")
 
@@ -66,7 +65,7 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
     if head not in members or (head in wording.fixed and not rest):
         before = name.removesuffix(".".join(path))
         known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
-        fix = suggestion(name, known) or f"see {wording.where}"
+        fix = did_you_mean(name, known, f"see {wording.where}")
         raise _refused(name, "there is no such setting", fix, wording)
     present = members[head]
     if name in wording.named and not rest:
@@ -74,7 +73,7 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
         if value in whole:
             return replace(settings, **{head: whole[value]})
         single = f"take one of {', '.join(whole)}, or name a single setting of it"
-        fix = suggestion(value, whole) or single
+        fix = did_you_mean(value, whole, single)
         raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
@@ -173,12 +172,6 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
         if isinstance(kind, enum.EnumMeta):
             expected = ", ".join(kind)
         raise refused(f"expected {expected}", "choose another value") from None
-
-
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """A question after the most similar of some names; empty if none is similar."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
-    return f"did you mean {close[0]}?" if close else ""
 
 
 def _refused(what: str, why: str, fix: str, wording: Wording) -> UsageError:

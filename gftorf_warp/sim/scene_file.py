@@ -16,8 +16,7 @@ from pathlib import Path as FilePath
 from typing import Any, Union
 
 from ..data.texts import read_toml
-from ..errors import InputError
-from ..scene.changes import suggestion
+from ..errors import InputError, did_you_mean
 from ..scene.sensor import Sensor
 from .assembly import Assembly, Level
 from .curves import Guided
@@ -76,7 +75,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     for key in table:
         if key not in known:
-            fix = suggestion(key, known) or f"there are {', '.join(known)}"
+            fix = did_you_mean(key, known, f"there are {', '.join(known)}")
             raise _wrong(path, _join(where, key), f"a {kind.__name__} has no such setting", fix)
     for name, f in known.items():
         if name not in table and f.default is MISSING and f.default_factory is MISSING:

@@ -13,8 +13,7 @@ from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
 from ..data.read import read, read_truth
 from ..data.write import write
-from ..errors import UsageError
-from ..scene.changes import suggestion
+from ..errors import UsageError, did_you_mean
 from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format, check_numbers
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
@@ -151,6 +150,6 @@ def scene_of(scene: str | Scene, overrides: Iterable[str] = (), seed: int = 0) -
     if found is None:
         others = "take one of these, `--list` describes them, or a file that ends in .toml"
         named = *SCENES, PREFIX, f"{PREFIX}-N"
-        why, fix = f"the named scenes are {', '.join(named)}", suggestion(scene, named) or others
+        why, fix = f"the named scenes are {', '.join(named)}", did_you_mean(scene, named, others)
         raise UsageError(f"there is no scene named {scene!r}", where="SCENE", why=why, fix=fix)
     return overridden(found, overrides)

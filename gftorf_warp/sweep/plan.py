@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..data.texts import read_toml
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from ..recon import presets
-from ..scene.changes import suggestion
 from ..sim.scenes import SCENES
 from ..sim.settings import SimSettings
 
@@ -163,7 +162,7 @@ def _check_keys(found: Iterable[str], known: Iterable[str], path: Path, where: s
     known = list(known)
     for key in found:
         if key not in known:
-            hint = suggestion(key, known) or f"there are {', '.join(known)}"
+            hint = did_you_mean(key, known, f"there are {', '.join(known)}")
             raise _wrong(path, where + key, f"there is no such key: {hint}")
 
 
@@ -184,7 +183,7 @@ def _scene(word: str, path: Path) -> Scene:
         return Scene(name=word)
     folder = path.parent / word
     if not folder.is_dir():
-        hint = suggestion(word, [*SCENES, "random-0"])
+        hint = did_you_mean(word, [*SCENES, "random-0"])
         raise _wrong(path, "scenes", f"{word!r} is neither a scene nor a folder. {hint}".rstrip())
     name = folder.resolve().name
     return Scene(name=name if NAME.fullmatch(name) else "sequence", sequence=folder.resolve())
