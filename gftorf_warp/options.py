@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from . import __version__
-from .errors import UsageError, did_you_mean
+from .errors import UsageError
+from .similar import did_you_mean
 
 FRESH = "start over in a folder that is not empty"
 MOVED = "where the sequence of the run is now, if it was moved; RUN remembers it"

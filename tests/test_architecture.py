@@ -33,11 +33,11 @@ INSIDE_FUNCTIONS = {
     "trimesh",
     "viser",
 }  # slow to import, or not needed by every command
-# room: (rooms it may import besides itself, packages it may import); constants and errors are free
-# to all
+# room: (rooms it may import besides itself, packages it may import); those of FREE are free to all
 TABLE = {
     "constants.py": (set(), set()),
     "errors.py": (set(), set()),
+    "similar.py": (set(), set()),
     "kernels": (set(), {"warp"}),
     "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy"}),
     "importers": ({"data"}, {"cv2", "h5py", "jaxtyping", "numpy", "rawpy"}),
@@ -58,7 +58,7 @@ TABLE = {
     ),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
-FREE = {"constants", "errors", "__version__"}
+FREE = {"constants", "errors", "similar", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
     "render/cuda.py": "streams and graphs that both use",

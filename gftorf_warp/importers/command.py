@@ -13,7 +13,8 @@ from ..data.sequence import Sequence
 from ..data.untrusted import read_text
 from ..data.write import write
 from ..data.writing import refuse_inexpressible
-from ..errors import InputError, UsageError, did_you_mean
+from ..errors import InputError, UsageError
+from ..similar import did_you_mean
 from .imported import Imported
 from .keys import load, template
 from .kinds import KINDS, Kind

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from ..data.texts import read_toml
-from ..errors import InputError, UsageError, did_you_mean, similar
+from ..errors import InputError, UsageError
+from ..similar import did_you_mean, similar
 
 CONFIG = "--config"
 WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}

@@ -14,7 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, Union
 
-from ..errors import UsageError, did_you_mean
+from ..errors import UsageError
+from ..similar import did_you_mean
 
 Settings = TypeVar("Settings")
 

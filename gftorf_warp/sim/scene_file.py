@@ -16,8 +16,9 @@ from pathlib import Path as FilePath
 from typing import Any, Union
 
 from ..data.texts import read_toml
-from ..errors import InputError, did_you_mean
+from ..errors import InputError
 from ..scene.sensor import Sensor
+from ..similar import did_you_mean
 from .assembly import Assembly, Level
 from .curves import Guided
 from .meshes import Mesh

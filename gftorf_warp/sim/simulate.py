@@ -13,7 +13,8 @@ from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
 from ..data.read import read, read_truth
 from ..data.write import write
-from ..errors import UsageError, did_you_mean
+from ..errors import UsageError
+from ..similar import did_you_mean
 from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format, check_numbers
 from .closed_form_errors import Errors, closed_form_errors, ladder_table

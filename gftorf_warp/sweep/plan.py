@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from ..data.texts import read_toml
-from ..errors import InputError, did_you_mean
+from ..errors import InputError
 from ..recon import presets
 from ..sim.scenes import SCENES
 from ..sim.settings import SimSettings
+from ..similar import did_you_mean
 
 PLAIN = "plain"  # name of the row without changes
 RANDOM = re.compile(r"random-\d+")
