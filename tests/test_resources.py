@@ -1,13 +1,18 @@
 """Memory and disk of a command are compared with what is free before anything is allocated."""
 
+import functools
 import shutil
 import subprocess
 import sys
 from collections import namedtuple
 
+import foreign
+import kinect2_dump
 import numpy as np
 import pytest
+from export_run import FRAMES, HEIGHT, WIDTH, exportable
 from moving_box import recording
+from recordings import WRITERS
 from sequences import changed
 
 from gftorf_warp.cli import main
@@ -15,6 +20,7 @@ from gftorf_warp.data import resources
 from gftorf_warp.data.folder import empty_quads
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import ResourceError
+from gftorf_warp.export.command import FORMATS, export
 from gftorf_warp.recon.train import reconstruct
 
 GB = 1_000_000_000
@@ -98,6 +104,86 @@ def test_reconstruct_compare_and_render_are_refused(run, tmp_path, capsys, monke
     refused(words, capsys, "--times")
     assert not (tmp_path / "out").exists()
     assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_export_is_refused(run, tmp_path, capsys, monkeypatch, name):
+    """Of every format, by what it writes or what it holds meanwhile."""
+    usage = namedtuple("usage", "total used free")
+    words = ["export", str(run), "--out", str(tmp_path / "out"), "--device", "cpu", "--format"]
+    if not FORMATS[name].of_gaussians:  # the closed form has none
+        needs = FORMATS[name].needs
+        if needs.of_pixel:
+            monkeypatch.setattr(resources, "free_memory", lambda: 2e5)
+            refused([*words, name], capsys, "not enough memory", "--every")
+            monkeypatch.undo()
+        if needs.file:
+            monkeypatch.setattr(resources.shutil, "disk_usage", lambda _: usage(1e9, 1e9, 20))
+            refused([*words, name], capsys, "not enough disk space", "--every")
+        assert not (tmp_path / "out").exists()
+    assert resources.to_export([FORMATS[name].needs], 10, 10**7, 10**7).memory >= (name != "tum")
+
+
+def test_an_estimate_is_no_more_than_what_an_export_takes(tmp_path):
+    """Nothing is refused that would have worked: of Gaussians and pixels that are all there."""
+    run = exportable(tmp_path)
+    names = ["ply", "points", "exr", "npz", "colmap", "nerfstudio", "tum"]
+    targets = export(run, tmp_path / "out", names)
+    present = int((run.field.layer == 0).sum())
+    for name, target in zip(names, targets, strict=True):
+        files = [target] if target.is_file() else [p for p in target.rglob("*") if p.is_file()]
+        found = sum(path.stat().st_size for path in files)
+        need = resources.to_export([FORMATS[name].needs], FRAMES, HEIGHT * WIDTH // 2, present)
+        assert 0.05 * found < need.disk < found, name
+
+
+def arrays_of(place, save, name):
+    """Twelve raw frames in a file, and their keys."""
+    (place / "source").mkdir()
+    save(place / "source" / name, foreign.recording()[1])
+    (place / "keys.toml").write_text(foreign.keys(values__zero=0))
+    return place / "source", place / "keys.toml"
+
+
+def camera_of(name, place):
+    """The recording of a camera, and its keys."""
+    WRITERS[name](place)
+    return place / "recording", place / "keys.toml"
+
+
+def kinect2_of(place):
+    """A dump, whose tables say all."""
+    kinect2_dump.write(place / "source")
+    return place / "source", None
+
+
+def folder_of(form, place):
+    """A folder of the TöRF family, which needs no keys."""
+    return write(form, place / "source", *recording(frames=8)), None
+
+
+BY_KIND = {  # kind: writes a recording and returns source and keys
+    "arrays": lambda place: arrays_of(place, np.save, "quads.npy"),
+    "arrays, packed": lambda place: arrays_of(place, np.savez_compressed, "quads.npz"),
+    "kinect2": kinect2_of,
+    **{name: functools.partial(camera_of, name) for name in WRITERS},
+    **{form: functools.partial(folder_of, form) for form in ("ftorf", "torf")},
+}
+
+
+@pytest.mark.parametrize("name", BY_KIND)
+def test_an_import_is_refused(tmp_path, capsys, monkeypatch, name):
+    """Of every kind, before the raw frames are in memory, or before they are on the disk."""
+    source, keys = BY_KIND[name](tmp_path)
+    words = ["import", name.partition(",")[0], str(source), "--out", str(tmp_path / "seq")]
+    words += [] if keys is None else ["--config", str(keys)]
+    monkeypatch.setattr(resources, "free_memory", lambda: 100.0)
+    refused(words, capsys, "not enough memory")
+    monkeypatch.undo()
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(resources.shutil, "disk_usage", lambda _: usage(1e9, 1e9, 100))
+    refused(words, capsys, "not enough disk space", "give fewer files")
+    assert not (tmp_path / "seq").exists()
 
 
 def test_less_is_needed_for_reduced_images(tmp_path, monkeypatch):

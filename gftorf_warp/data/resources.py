@@ -8,8 +8,10 @@ nothing is refused that would have worked.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import ResourceError
 from .files import as_errors
@@ -39,6 +41,16 @@ def to_read(frames: int, pixels: int) -> Need:
     return Need(memory=8.0 * frames * pixels)
 
 
+def to_import(frames: int, pixels: int) -> Need:
+    """A recording of F raw frames in memory, twice while it is written, and a capture of it."""
+    return Need(memory=8.0 * frames * pixels, disk=frames * (1e3 + 0.3 * pixels))
+
+
+def to_open(size: float) -> Need:
+    """A file of so many bytes, unpacked, that is read whole."""
+    return Need(memory=float(size))
+
+
 def to_reconstruct(frames: int, pixels: int, gaussians: int) -> Need:
     """Optimisation of N Gaussians: observations, state, renderings, three checkpoints."""
     memory = 120.0 * frames * pixels + 300.0 * pixels + 3e3 * gaussians
@@ -62,6 +74,43 @@ def to_render(images: int, pixels: int, channels: int, *, arrays: bool, held: in
     values = float(channels * pixels)
     disk = images * (4.0 * values if arrays else 4e3 + 1.5 * values)
     return Need(memory=300.0 * pixels + 4.0 * values * min(held, images), disk=disk)
+
+
+class Exported(NamedTuple):
+    """What a format of ``gftorf export`` needs [B], see :func:`to_export`."""
+
+    of_pixel: float = 0.0
+    """Memory."""
+    of_gaussian: float = 0.0
+    """Memory."""
+    file: float = 0.0
+    """Disk of a moment, however small its image."""
+    file_of_pixel: float = 0.0
+    """Disk."""
+    file_of_gaussian: float = 0.0
+    """Disk."""
+
+
+def to_export(formats: Iterable[Exported], moments: int, pixels: int, gaussians: int) -> Need:
+    """Files of S moments in some formats, one format after the other and moment by moment.
+
+    Args:
+        formats: What each needs.
+        moments: Number of moments.
+        pixels: Of the sequence's camera.
+        gaussians: Those that exist at every moment.
+    """
+    memory, disk = 0.0, 0.0
+    for one in formats:
+        memory = max(memory, one.of_pixel * pixels + one.of_gaussian * gaussians)
+        files = one.file + one.file_of_pixel * pixels + one.file_of_gaussian * gaussians
+        disk += moments * files
+    return Need(memory=memory, disk=disk)
+
+
+def to_fuse(nodes: int) -> Need:
+    """A surface on a grid."""
+    return Need(memory=12.0 * nodes)
 
 
 def require(need: Need, where: Path | str, fix: str, *, free: float | None = None) -> None:

@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..data import resources
 from ..data.files import as_errors, atomic_folder
+from ..data.resources import Exported
 from ..errors import UsageError
 from ..recon.joined import refused
 from ..recon.run import Run
+from ..scene.windows import Windows
 from . import cameras, film, images, listed, mesh, points, scene_page, splats
 from .moments import Moments, Progress
 
@@ -24,25 +27,36 @@ class Format(NamedTuple):
     """Folder or file below the output folder."""
     write: Callable[..., Any]
     """Fills the new folder, or makes the file: called with moments, path and progress."""
+    needs: Exported
+    """Memory and disk, at least."""
     coloured: bool = False
     """Whether it also takes ``colour``."""
     of_gaussians: bool = False
     """Whether a run without Gaussians has nothing to write."""
 
 
+SPLATS = Exported(of_gaussian=500.0, file=500.0, file_of_gaussian=68.0)  # 17 numbers
+PAGE = Exported(of_gaussian=500.0)
+POINTS = Exported(of_pixel=400.0, file=500.0, file_of_pixel=10.0)  # 23 B, of half the pixels
+MESH = Exported(of_pixel=150.0, file=1e5)
+EXRS = Exported(of_pixel=150.0, file=1e3, file_of_pixel=4.5)  # three channels, compressed
+NPZS = Exported(of_pixel=250.0, file=1e3, file_of_pixel=12.0)
+PICTURES = Exported(of_pixel=300.0, file=100.0, file_of_pixel=0.5)
+FILM = Exported(of_pixel=500.0)
 FORMATS = {
-    "ply": Format("ply", splats.write, coloured=True, of_gaussians=True),
-    "points": Format("points", points.write, coloured=True),
-    "mesh": Format("mesh", functools.partial(mesh.write, kind="ply")),
-    "obj": Format("obj", functools.partial(mesh.write, kind="obj")),
-    "exr": Format("exr", images.write_exrs),
-    "npz": Format("npz", images.write_npzs),
-    "colmap": Format("colmap", cameras.write_colmap, coloured=True),
-    "nerfstudio": Format("nerfstudio", cameras.write_nerfstudio, coloured=True),
-    "tum": Format("poses.txt", cameras.write_tum),
-    "html": Format("scene.html", scene_page.write, coloured=True, of_gaussians=True),
-    **{kind: Format(f"video.{kind}", film.write) for kind in ("webm", "mp4", "gif", "webp")},
+    "ply": Format("ply", splats.write, SPLATS, coloured=True, of_gaussians=True),
+    "points": Format("points", points.write, POINTS, coloured=True),
+    "mesh": Format("mesh", functools.partial(mesh.write, kind="ply"), MESH),
+    "obj": Format("obj", functools.partial(mesh.write, kind="obj"), MESH),
+    "exr": Format("exr", images.write_exrs, EXRS),
+    "npz": Format("npz", images.write_npzs, NPZS),
+    "colmap": Format("colmap", cameras.write_colmap, PICTURES, coloured=True),
+    "nerfstudio": Format("nerfstudio", cameras.write_nerfstudio, PICTURES, coloured=True),
+    "tum": Format("poses.txt", cameras.write_tum, Exported(file=10.0)),
+    "html": Format("scene.html", scene_page.write, PAGE, coloured=True, of_gaussians=True),
+    **{kind: Format(f"video.{kind}", film.write, FILM) for kind in ("webm", "mp4", "gif", "webp")},
 }
+"""Their needs are slopes of measured peaks, see design/resources.md."""
 
 
 def export(
@@ -79,7 +93,7 @@ def export(
         UsageError: If a format or colour is unknown, the run lacks it, or files exist that were
             made of something else.
         InputError: If the sequence cannot be read.
-        ResourceError: If the disk is full.
+        ResourceError: If memory or disk cannot hold the files.
     """
     names, out = checked(formats), Path(out)
     if colour is not None and colour not in COLOURS:
@@ -93,6 +107,8 @@ def export(
         target: listed.asked_of(moments, shown if FORMATS[name].coloured else None)
         for target, name in targets.items()
     }
+    missing = [name for target, name in targets.items() if fresh or not target.exists()]
+    check_resources(moments, missing, out)
     for target in listed.remaining(out, asked, fresh=fresh):
         kind = FORMATS[targets[target]]
         write = functools.partial(kind.write, **{"colour": shown} if kind.coloured else {})
@@ -142,3 +158,18 @@ def check_content(moments: Moments, names: Iterable[str], colour: str) -> None:
     if colour == "colour" and not moments.run.has_colour:
         why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
         raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
+
+
+def check_resources(moments: Moments, names: Iterable[str], out: Path) -> None:
+    """Whether memory and disk can hold the files of some formats.
+
+    Raises:
+        ResourceError: If not.
+    """
+    run, camera = moments.run, moments.cameras[0]
+    layer = run.field.layer
+    windows = isinstance(run.motion, Windows) and layer is not None
+    always = int((layer == 0).sum()) if windows else len(run.field)
+    size = len(moments), camera.width * camera.height, always
+    need = resources.to_export([FORMATS[name].needs for name in names], *size)
+    resources.require(need, out, "write fewer moments, --every 4 or --times, or fewer formats")

@@ -8,12 +8,14 @@ transparent, nothing is known.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..data import resources
 from ..data.files import write_through
 from ..errors import UsageError
 from ..evaluate.metrics import normalised
@@ -32,11 +34,14 @@ def write(moments: Moments, folder: Path, progress: Progress, *, kind: str) -> N
 
     Raises:
         UsageError: If nothing is opaque.
+        ResourceError: If memory cannot hold the grid.
     """
     for index in range(len(moments)):
         cameras = views_of(moments, index)
         distance = distances(moments, index, cameras)
         low, nodes, voxel = grid(distance, cameras)
+        need = resources.to_fuse(math.prod(nodes))
+        resources.require(need, folder, "leave mesh and obj out: points need less")
         device = str(moments.run.field.device)
         vertices, triangles = surface(distance, cameras, low, nodes, voxel, device)
         about = [*moments.about(index), f"voxel {voxel:.4g} metres"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..data.capture_json import MANIFEST
 from ..data.files import as_errors, atomic_write, refuse_target, sweep, temporary_name
+from ..data.resources import Need, to_import
 from ..data.sequence import Sequence
 from ..data.untrusted import read_text
 from ..data.write import write
@@ -18,6 +19,7 @@ from ..similar import did_you_mean
 from .imported import Imported
 from .keys import load, template
 from .kinds import KINDS, Kind
+from .raw_files import check_room
 
 LOG = logging.getLogger("gftorf_warp")
 README = "README.md"  # what was understood, in the capture
@@ -90,13 +92,16 @@ def import_recording(
 
     Raises:
         UsageError, InputError: As :func:`read_recording`, or if the folder is not empty.
-        ResourceError: If the disk is full.
+        ResourceError: If memory or disk cannot hold the recording.
     """
     again = out is not None and _is_import(Path(out), name)
     if out is not None and not again:
         refuse_target(Path(out))  # before minutes of reading
     imported = read_recording(name, source, config)
     refuse_inexpressible("capture", imported.sequence, imported.truth)  # a dry run says so, too
+    if out is not None:
+        pixels = imported.sequence.height * imported.sequence.width
+        check_room(Need(disk=to_import(imported.sequence.frames, pixels).disk), Path(out))
     lines = [_summary(imported.sequence), *imported.understood]
     for text in imported.uncertain:
         LOG.warning("uncertain: %s", text)

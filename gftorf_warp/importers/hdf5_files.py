@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..data.resources import to_open
 from ..data.untrusted import PACKED_MAX, unreadable
 from ..errors import InputError, ResourceError
+from .raw_files import check_room
 
 if TYPE_CHECKING:
     import h5py
@@ -78,6 +80,7 @@ def checked(path: Path, dataset: h5py.Dataset) -> np.ndarray:
 
     Raises:
         InputError: If they are no numbers, stored elsewhere, or more than the file can hold.
+        ResourceError: If memory cannot hold them.
     """
     where = f"{path}, {dataset.name}"
     if dataset.dtype.kind not in "iuf":
@@ -90,6 +93,7 @@ def checked(path: Path, dataset: h5py.Dataset) -> np.ndarray:
     if dataset.size == 0 or dataset.nbytes > most:
         why = f"expected 1 to {most} bytes, found {dataset.nbytes} for shape {dataset.shape}"
         raise InputError("not complete", where=where, why=why, fix="copy or export the file again")
+    check_room(to_open(dataset.nbytes), path)
     return np.asarray(dataset[()])
 
 

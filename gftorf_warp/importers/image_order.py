@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from ..data.arrays import SIDE_MAX
+from ..data.resources import to_import
 from ..errors import InputError
 from .imported import Notes
 from .keys import Key, Settings
-from .raw_files import natural
+from .raw_files import check_room, natural
 from .stacks import BY_AXES, SUFFIXES, Stack, open_stack
 
 SPARSE = 10  # raw frames per file: with more missing, the numbers count something else
@@ -65,13 +67,27 @@ def patterns_of(source: Path, settings: Settings) -> list[list[Path]]:
 
 
 def read_images(
-    files: list[Path], settings: Settings, slots: int, taps: int, notes: Notes
+    files: list[Path],
+    settings: Settings,
+    slots: int,
+    taps: int,
+    notes: Notes,
+    others: int = 0,
 ) -> Iterator[tuple[Path, np.ndarray]]:
     """The images [H, W] of files in their order, with the file: raw frame by raw frame, and tap by
     tap of each.
 
+    Args:
+        files: The files.
+        settings: Values of the keys of files and axes.
+        slots: Slots that an axis of a file may have.
+        taps: Images of a raw frame.
+        notes: What was understood is added.
+        others: Number of further patterns with as many raw frames.
+
     Raises:
         InputError: If a file is not what the keys say.
+        ResourceError: If memory cannot hold the raw frames of all files.
     """
     told = False
     for path in files:
@@ -85,6 +101,9 @@ def read_images(
             notes.understood.append(f"images: {text} as {', '.join(axes)} ({source})")
         order = [axes.index(name) for name in (*FRAMES, *IMAGE) if name in axes]
         array = stack.array.transpose(order)
+        if path == files[0]:
+            images = len(files) * math.prod(array.shape[:-2]) * (1 + others)
+            check_room(to_import(images // taps, math.prod(array.shape[-2:])), path)
         for index in np.ndindex(array.shape[:-2]):
             yield path, array[index]
 

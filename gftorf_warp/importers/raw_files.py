@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from ..data.resources import Need, require
 from ..data.untrusted import check_links, unreadable
 from ..errors import InputError
 
@@ -31,6 +32,16 @@ def files_of(source: Path) -> list[Path]:
         why, fix = "expected the files of a recording, found none", "check the path"
         raise InputError("an empty folder", where=source, why=why, fix=fix)
     return sorted(found, key=lambda path: natural(path.name))
+
+
+def check_room(need: Need, where: Path) -> None:
+    """Check that memory and disk can hold a recording.
+
+    Raises:
+        ResourceError: If not.
+    """
+    fix = "import a part of the recording: give fewer files, of kind arrays by source.files"
+    require(need, where, fix)
 
 
 def natural(name: str) -> list[tuple[int, str]]:

@@ -135,10 +135,9 @@ def _in_order(
         why += f" or {len(taps)} taps" if len(taps) > 1 else ""
         raise settings.wrong("source.files", f"{why}, found {len(patterns)}", "list as many")
     inside, slots = (1 if by_tap else len(taps)), (cycle if by_tap or len(patterns) == 1 else 1)
-    streams = [
-        _grouped(image_order.read_images(files, settings, slots, inside, notes), inside)
-        for files in patterns
-    ]
+    others = 0 if by_tap else len(patterns) - 1
+    given = settings, slots, inside, notes, others
+    streams = [_grouped(image_order.read_images(files, *given), inside) for files in patterns]
     ended = False
     for groups in itertools.zip_longest(*streams):
         present = [group for group in groups if group is not None]

@@ -17,10 +17,12 @@ from ..data.arrays import map_array
 from ..data.exr import read_exr
 from ..data.matlab import read_matrix
 from ..data.pictures import read_picture
+from ..data.resources import to_open
 from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
-from ..errors import InputError
+from ..errors import GftorfError, InputError
 from . import hdf5_files
 from .keys import Key, Settings
+from .raw_files import check_room, size_of
 
 NUMPY, ZIPPED = (".npy",), (".npz",)
 HDF5, MATLAB = (".h5", ".hdf5", ".he5"), (".mat",)
@@ -107,10 +109,12 @@ def open_stack(path: Path, settings: Settings) -> Stack:
     Raises:
         InputError: If it is not a whole file of its kind, holds no real numbers, or several arrays
             and none is named.
-        ResourceError: If it is an HDF5 file and h5py is not installed.
+        ResourceError: If it is an HDF5 file and h5py is not installed, or too large for memory.
     """
     suffix, name = path.suffix.lower(), settings["source.dataset"]
     axes = None
+    if suffix not in (*NUMPY, *RAW):
+        check_room(to_open(size_of(path)), path)
     if suffix in NUMPY:
         array = map_array(path)
     elif suffix in ZIPPED:
@@ -148,9 +152,10 @@ def _zipped(path: Path, name: str | None) -> np.ndarray:
             size = path.stat().st_size
             if member.file_size > PACKED_MAX * size or member.compress_size > size:
                 raise ValueError(f"{member.file_size} bytes packed into {size}")
+            check_room(to_open(member.file_size), path)
         with np.load(path, allow_pickle=False) as arrays:
             return arrays[member.filename.removesuffix(".npy")]
-    except InputError:
+    except GftorfError:
         raise
     except Exception as error:  # as of .npy files, and what damaged archives raise
         raise unreadable(
