@@ -19,7 +19,7 @@ import repository  # noqa: E402
 from gftorf_warp import __version__  # noqa: E402
 
 project = "gftorf_warp"
-author = "the authors of gftorf_warp"
+author = "gftorf_warp contributors"
 copyright = author
 version = release = __version__
 
