@@ -39,6 +39,7 @@ AMPLITUDE_SPREAD = 0.3  # [1] standard deviation of an extrapolated amplitude, r
 EXTRAPOLATION = 0.7  # [1] at most, of the logarithm of the amplitude
 MODEL_ERROR = 0.01  # [amplitudes] of a rendered phasor, of the largest amplitude nearby
 LEAST = 1e-12  # [quad units] below it a neighbour is black
+MARGIN = 2  # [pixels] to the farthest neighbour
 
 
 def resolved(rendering: Rendering, sensor: Sensor) -> Rendering:
@@ -79,12 +80,13 @@ def _resolved(
     nearby = torch.nn.functional.max_pool2d(amplitude[None], 3, stride=1, padding=1)[0]
     total = torch.full_like(distance, 1.0 / math.pi)  # density of any phasor in a unit disc
     weighted = total * distance
+    beyond, light = _padded(distance), _padded(torch.log(amplitude))
     on_first = torch.special.ndtr((_shares(distance.device) - 0.5) / BLUR)
     for direction in DIRECTIONS:
         before, after = (-direction[0], -direction[1]), direction
-        mixed = where & _between_two_surfaces(distance, before, after)
+        mixed = where & _between_two_surfaces(beyond, before, after)
         pixels = torch.nonzero(mixed, as_tuple=True)
-        first, second = _sides(distance, amplitude, pixels, (before, after))
+        first, second = _sides(beyond, light, pixels, (before, after))
         likelihood = _likelihood(phasor[pixels], nearby[pixels], first, second, sensor) / SHARES
         odds = (likelihood * on_first[:, None]).sum(dim=0)
         both = likelihood.sum(dim=0)
@@ -99,7 +101,7 @@ def _shares(device: torch.device) -> Float[Tensor, "s"]:
 
 
 def _between_two_surfaces(
-    distance: Float[Tensor, "H W"], before: tuple[int, int], after: tuple[int, int]
+    distance: Float[Tensor, "h w"], before: tuple[int, int], after: tuple[int, int]
 ) -> Bool[Tensor, "H W"]:
     """Pixels with a step between the neighbours on both sides, each of which has a neighbour of its
     own at nearly the same distance.
@@ -112,26 +114,31 @@ def _between_two_surfaces(
     return found
 
 
+def _padded(image: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+    """The image, continued by its border pixels."""
+    return torch.nn.functional.pad(image[None], (MARGIN,) * 4, mode="replicate")[0]
+
+
 def _neighbour(
-    image: Float[Tensor, "H W"], towards: tuple[int, int], steps: int = 1
+    padded: Float[Tensor, "h w"], towards: tuple[int, int], steps: int = 1
 ) -> Float[Tensor, "H W"]:
-    """The image at every pixel's neighbour, the pixel at the border beyond it."""
-    rows, columns = (
-        (torch.arange(size, device=image.device) + steps * along).clamp(0, size - 1)
-        for size, along in zip(image.shape, towards, strict=True)
-    )
-    return image[rows[:, None], columns]
+    """The image at every pixel's neighbour, the pixel at the border beyond it; a view."""
+    top, left = (MARGIN + steps * along for along in towards)
+    height, width = (size - 2 * MARGIN for size in padded.shape)
+    return padded[top : top + height, left : left + width]
 
 
 def _sides(
-    distance: Float[Tensor, "H W"],
-    amplitude: Float[Tensor, "H W"],
+    distance: Float[Tensor, "h w"],
+    light: Float[Tensor, "h w"],
     pixels: tuple[Int[Tensor, "P"], ...],
     towards: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[_Side, _Side]:
-    """The surfaces on both sides of some pixels."""
+    """The surfaces on both sides of some pixels, from padded distances and logarithms of
+    amplitudes.
+    """
     first, second = (_neighbour(distance, direction)[pixels] for direction in towards)
-    light, amplitudes = torch.log(amplitude), []
+    amplitudes = []
     for direction, in_front in zip(towards, (first < second, second < first), strict=True):
         once, twice = (_neighbour(light, direction, steps)[pixels] for steps in (1, 2))
         beyond = (once - twice).clamp(-EXTRAPOLATION, EXTRAPOLATION)
