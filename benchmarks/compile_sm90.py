@@ -102,15 +102,18 @@ def modules(arch: int) -> dict[str, wp.Module]:
     found["finish_moments"] = composite_backward.finish_moments.module
     found["finish_slopes"] = splat_distance.finish_slopes.module
     for colour in (False, True):
-        for square, sloped in ((False, False), (True, False), (False, True)):
-            kernel = project.make_project(colour, square, sloped=sloped)
+        variants = (False, False), (True, False), (False, True)
+        for (square, sloped), adjoint in itertools.product(variants, (False, True)):
+            kernel = project.make_project(colour, square, sloped=sloped, adjoint=adjoint)
             title = "project" + " colour" * colour + " square" * square + " sloped" * sloped
-            found[title] = kernel.module
+            found[title + " adjoint" * adjoint] = kernel.module
     for sloped in (False, True):
         given = *shape, True, False, True, None, False, 1, sloped, True
         title = "composite light without median" + " sloped" * sloped
         found[title] = composite.make_composite(*given).module
-    found["project sloped lens"] = project.make_project(False, False, True, sloped=True).module
+    for adjoint in (False, True):
+        kernel = project.make_project(False, False, True, True, adjoint)
+        found["project sloped lens" + " adjoint" * adjoint] = kernel.module
     given = *shape, True, False, False, None, False, False, SEGMENTS["cuda"], True, True
     title = "composite_backward light without in segments sloped calibrated"
     found[title] = composite_backward.make_composite_backward(*given).module

@@ -44,7 +44,7 @@ def project_backward(
     adjoint = [getattr(wanted, name) for name in _PROJECTED]
     if any(array is not None for array in [*adjoint, wanted.calibration]):
         _launch(
-            _project_kernel(inputs, view, buffers),
+            _project_kernel(inputs, view, buffers, adjoint=True),
             buffers.count,
             _project_inputs(inputs, view, buffers),
             _project_outputs(buffers),
@@ -54,9 +54,9 @@ def project_backward(
         )
 
 
-def _project_kernel(inputs: Inputs, view: View, buffers: Buffers):
+def _project_kernel(inputs: Inputs, view: View, buffers: Buffers, *, adjoint: bool = False):
     square = buffers.settings.support == Support.SIGMA3_TILE16
-    return make_project(inputs.colour_sh is not None, square, view.lens, buffers.sloped)
+    return make_project(inputs.colour_sh is not None, square, view.lens, buffers.sloped, adjoint)
 
 
 def _project_inputs(inputs: Inputs, view: View, buffers: Buffers) -> list:

@@ -92,13 +92,10 @@ def veil_of(view: CameraView) -> Splat:
     )  # fmt: skip
 
 
-@wp.func_grad(veil_of)
-def adj_veil_of(view: CameraView, adj_ret: Splat):
-    """No derivative."""
-
-
 @functools.cache
-def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = False):
+def make_project(
+    colour: bool, square: bool, lens: bool = False, sloped: bool = False, adjoint: bool = False
+):
     """The kernel for a field with or without colour.
 
     Args:
@@ -106,10 +103,12 @@ def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = 
         square: Whether splats are cut by the 3-sigma square (parity with the released code).
         lens: Whether the camera is no pinhole.
         sloped: Whether the distance varies inside a splat: other slots 11-15, see splat.py.
+        adjoint: Whether its adjoint is launched, in which a Gaussian that is not finite is no case
+            of its own: the image is NaN already, and the check costs registers.
     """
 
     # __sinf would lose the phase beyond +-pi
-    @wp.kernel(module="unique", module_options={"fast_math": False})
+    @wp.kernel(module="unique", enable_backward=adjoint, module_options={"fast_math": False})
     def project(
         # In:
         view: wp.array[CameraView],  # [1] the camera [m, px]
@@ -135,12 +134,13 @@ def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = 
         order[n] = n
         depth_key[n] = depth_culled
         box_px[n] = wp.vec4i(0, 0, 0, 0)
-        placed = wp.isfinite(mean[n]) and wp.isfinite(quaternion[n])
-        if not (placed and wp.isfinite(log_scale[n]) and wp.isfinite(opacity_logit[n])):
-            depth_key[n] = 0
-            box_px[n] = wp.vec4i(0, 0, camera.width, camera.height)
-            splats[n] = veil_of(camera)
-            return
+        if wp.static(not adjoint):
+            placed = wp.isfinite(mean[n]) and wp.isfinite(quaternion[n])
+            if not (placed and wp.isfinite(log_scale[n]) and wp.isfinite(opacity_logit[n])):
+                depth_key[n] = 0
+                box_px[n] = wp.vec4i(0, 0, camera.width, camera.height)
+                splats[n] = veil_of(camera)
+                return
         opacity = sigmoid(opacity_logit[n])
         local = camera.rotation * mean[n] + camera.translation
         if local[2] < camera.near or local[2] > camera.far or opacity < ALPHA_MIN:
