@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 from . import arrays, cornell_box, espros, kinect2, mlx7502x, oak, sequence_folders, voxel
 from .imported import Imported
@@ -26,63 +27,34 @@ class Kind:
     """Keys of its TOML file."""
 
 
+def _of(module: ModuleType, about: str) -> Kind:
+    """The kind that a module of its name reads."""
+    name = module.__name__.rpartition(".")[2]
+    return Kind(name=name, about=about, read=module.read, keys=module.KEYS)
+
+
+def _folder(name: str, about: str, read: Callable[[Path, Settings], Imported]) -> Kind:
+    """A folder of another program that is a sequence already."""
+    return Kind(name=name, about=about, read=read, keys=sequence_folders.KEYS)
+
+
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind(
-            name="arrays",
-            about="raw quads of any camera as arrays or pictures: NPY, NPZ, HDF5, MAT, PNG, TIFF, "
-            "EXR, raw binary",
-            read=arrays.read,
-            keys=arrays.KEYS,
+        _of(
+            arrays,
+            "raw quads of any camera as arrays or pictures: NPY, NPZ, HDF5, MAT, PNG, TIFF, EXR, "
+            "raw binary",
         ),
-        Kind(
-            name="ftorf",
-            about="an F-ToeRF folder of raw quads, with its truth",
-            read=sequence_folders.read_ftorf,
-            keys=sequence_folders.KEYS,
+        _folder(
+            "ftorf", "an F-ToeRF folder of raw quads, with its truth", sequence_folders.read_ftorf
         ),
-        Kind(
-            name="torf",
-            about="a ToeRF folder of phasors, with its truth",
-            read=sequence_folders.read_torf,
-            keys=sequence_folders.KEYS,
-        ),
-        Kind(
-            name="cornell_box",
-            about="a sequence of the Cornell-Box data set with motion, with its truth",
-            read=cornell_box.read,
-            keys=cornell_box.KEYS,
-        ),
-        Kind(
-            name="espros",
-            about="raw frames of an ESPROS TOFcam, or an HDF5 file of its recorder",
-            read=espros.read,
-            keys=espros.KEYS,
-        ),
-        Kind(
-            name="kinect2",
-            about="a folder of Kinect v2 packets and tables, dumped by libfreenect2",
-            read=kinect2.read,
-            keys=kinect2.KEYS,
-        ),
-        Kind(
-            name="mlx7502x",
-            about="buffers of a Melexis MLX75026 or MLX75027, dumped by V4L2",
-            read=mlx7502x.read,
-            keys=mlx7502x.KEYS,
-        ),
-        Kind(
-            name="oak",
-            about="raw frames of a Luxonis OAK with a ToF sensor",
-            read=oak.read,
-            keys=oak.KEYS,
-        ),
-        Kind(
-            name="voxel",
-            about="a .vxl file of the TI Voxel SDK, recorded in quad mode",
-            read=voxel.read,
-            keys=voxel.KEYS,
-        ),
+        _folder("torf", "a ToeRF folder of phasors, with its truth", sequence_folders.read_torf),
+        _of(cornell_box, "a sequence of the Cornell-Box data set with motion, with its truth"),
+        _of(espros, "raw frames of an ESPROS TOFcam, or an HDF5 file of its recorder"),
+        _of(kinect2, "a folder of Kinect v2 packets and tables, dumped by libfreenect2"),
+        _of(mlx7502x, "buffers of a Melexis MLX75026 or MLX75027, dumped by V4L2"),
+        _of(oak, "raw frames of a Luxonis OAK with a ToF sensor"),
+        _of(voxel, "a .vxl file of the TI Voxel SDK, recorded in quad mode"),
     )
 }
