@@ -267,6 +267,31 @@ def of_arrays(writer, place):
     )
 
 
+def phasors(place):
+    """I and Q of every quartet, of whose quads nothing else is left."""
+    path = sequence(sync=True)
+    quads = codes_of(path).reshape(-1, 4, *SIZE[::-1])
+    i, q = quads[:, 0] - quads[:, 2], quads[:, 1] - quads[:, 3]
+    np.save(place / "iq.npy", np.stack([i, q], axis=1).astype(np.int16))
+    changes = {
+        "sensor__taps": ["I", "Q"],
+        "source__axes": "frames taps rows columns",
+        "sensor__f_mod_hz": 20e6,
+        "sensor__shifts_deg": None,
+        "time__rate_hz": 0.25 / PERIOD,
+        "values__zero": 0,
+    }
+    return Recorded(
+        kind="arrays",
+        source=place / "iq.npy",
+        keys=foreign.keys(**changes),
+        quads=np.stack([i, -i, q, -q], axis=1).reshape(-1, *SIZE[::-1]) / 2,
+        distance=distance_of(path),
+        truth=path,
+        reconstruct=FITTED,
+    )
+
+
 def colour(place):
     """A camera that is carried around, its poses as lines of the TUM benchmark, and colour images
     of 16 bits.
@@ -312,7 +337,7 @@ WRITERS = {
     function.__name__: function
     for function in (
         *(espros, espros_hdf5, mlx7502x, voxel, oak, kinect2),
-        *(cornell_box, ftorf, torf, colour),
+        *(cornell_box, ftorf, torf, phasors, colour),
     )
 } | {
     f"arrays, {writer.__name__}": functools.partial(of_arrays, writer)

@@ -1,4 +1,4 @@
-"""Kind ``arrays``: raw quads as arrays or pictures of any layout that a dozen keys describe."""
+"""Kind ``arrays``: quads or phasors as arrays or pictures of any layout that keys describe."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from . import (
     codes,
     colour_keys,
     image_order,
+    phasors,
     pose_keys,
     raw_frames,
     sensor_keys,
@@ -25,6 +26,7 @@ KEYS = (
     *image_order.KEYS,
     *stacks.KEYS,
     *codes.KEYS,
+    phasors.KEY,
     *sensor_keys.KEYS,
     raw_frames.KEY,
     *timing.KEYS,
@@ -43,6 +45,9 @@ def read(source: Path, settings: Settings) -> Imported:
         ResourceError: If h5py is needed.
     """
     notes = Notes()
+    raw_frames.check_taps(settings)
+    if of_phasors := phasors.are_stored(settings):
+        settings = phasors.with_shifts(settings)
     patterns = image_order.patterns_of(source, settings)
     settings.require(
         *(name for files in patterns for name in stacks.needed_keys(files[0])),
@@ -50,7 +55,7 @@ def read(source: Path, settings: Settings) -> Imported:
         *colour_keys.needed_keys(settings, colour_keys.files_of(settings, source)),
     )
     modulation = sensor_keys.modulation_of(settings, notes)
-    cycle = len(modulation.shifts)
+    cycle = 1 if of_phasors else len(modulation.shifts)
     recorded = raw_frames.raw_frames_of(source, patterns, settings, cycle, notes)
     frames, height, width = recorded.quads.shape
     times = timing.times_of(settings, source, notes, frames, cycle)
@@ -61,19 +66,21 @@ def read(source: Path, settings: Settings) -> Imported:
         poses = np.tile(np.eye(4), (frames, 1, 1))
     several = len(set(modulation.frequencies_hz.tolist())) > 1
     lens = camera_keys.intrinsics_of(settings, notes, width, root=source, height=height)
-    return Imported(
-        sequence=Sequence(
-            quads=recorded.quads,
-            measured=recorded.measured,
-            shifts=np.resize(modulation.shifts + recorded.turned, frames),
-            times=times,
-            frequencies_hz=np.resize(modulation.frequencies_hz, frames) if several else None,
-            exposures=timing.exposures_of(settings, frames),
-            camera_from_world=poses,
-            intrinsics=lens,
-            calibration=modulation.calibration,
-            colour=colour,
-        ),
-        understood=tuple(notes.understood),
-        uncertain=tuple(notes.uncertain),
+    sequence = Sequence(
+        quads=recorded.quads,
+        measured=recorded.measured,
+        shifts=np.resize(modulation.shifts + recorded.turned, frames),
+        times=times,
+        frequencies_hz=np.resize(modulation.frequencies_hz, frames) if several else None,
+        exposures=timing.exposures_of(settings, frames),
+        camera_from_world=poses,
+        intrinsics=lens,
+        calibration=modulation.calibration,
+        colour=colour,
     )
+    if of_phasors:
+        text = "phasors: each is four raw frames of one time; what moved between them is lost"
+        notes.understood.append(f"{text} (sensor.taps)")
+        sequence = phasors.as_raw_frames(sequence)
+    understood, uncertain = tuple(notes.understood), tuple(notes.uncertain)
+    return Imported(sequence=sequence, understood=understood, uncertain=uncertain)

@@ -9,23 +9,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex64, Float
 
 from ..errors import InputError
-from . import codes, image_order
+from . import codes, image_order, phasors
 from .imported import Notes
 from .keys import Key, Settings
 
-TAPS = (("A-B",), ("A",), ("B",), ("A", "B"), ("B", "A"), ("A-B", "A+B"), ("A+B", "A-B"))
+QUADS = (("A-B",), ("A",), ("B",), ("A", "B"), ("B", "A"), ("A-B", "A+B"), ("A+B", "A-B"))
+TAPS = (*QUADS, *phasors.TAPS)
 HALF_TURN = {("B",): math.pi}  # the other tap sees the opposite phase
 KEY = Key(
     name="sensor.taps",
     kind=str,
-    about="images of each raw frame in their order: A-B; A; B; A and B; A-B and A+B",
+    about="images of each raw frame in their order: A-B; A; B; A and B; A-B and A+B; or of each "
+    "phasor: I and Q; amplitude and phase; -Q, -phase if they shrink with distance",
     example=("A-B",),
     default=("A-B",),
     shape=(None,),
-    choices=("A-B", "A", "B", "A+B"),
+    choices=("A-B", "A", "B", "A+B", "I", "Q", "-Q", "amplitude", "phase", "-phase"),
 )
 
 
@@ -33,14 +35,26 @@ KEY = Key(
 class RawFrames:
     """Raw frames in the order of time."""
 
-    quads: Float[np.ndarray, "F H W"]
-    """Values, code - zero; 0 in raw frames that were not measured."""
+    quads: Float[np.ndarray, "F H W"] | Complex64[np.ndarray, "F H W"]
+    """Values, code - zero; 0 in raw frames that were not measured. Complex: of phasors."""
     measured: Bool[np.ndarray, "F"]
     """Whether a raw frame was measured."""
     turned: float
     """Added to the shifts [rad]: that of the tap."""
     files: list[str] | None
     """Name of the file of each; None: a file has several, or some are missing."""
+
+
+def check_taps(settings: Settings) -> None:
+    """Check that the taps are a known pair or one.
+
+    Raises:
+        InputError: If not.
+    """
+    taps = settings[KEY.name]
+    if taps not in TAPS:
+        why = f"expected one of {'; '.join(', '.join(known) for known in TAPS)}"
+        raise settings.wrong(KEY.name, f"{why}, found {', '.join(taps)}", "name one of them")
 
 
 def raw_frames_of(
@@ -60,10 +74,6 @@ def raw_frames_of(
             damaged.
         ResourceError: If h5py is needed.
     """
-    taps = settings["sensor.taps"]
-    if taps not in TAPS:
-        why = f"expected one of {'; '.join(', '.join(known) for known in TAPS)}"
-        raise settings.wrong("sensor.taps", f"{why}, found {', '.join(taps)}", "name one of them")
     decoder = codes.Decoder(settings=settings)
     images = _in_order(patterns, settings, decoder, cycle, notes)
     quads, numbers = _stacked(patterns, settings, images, notes)
@@ -84,7 +94,7 @@ def raw_frames_of(
     return RawFrames(
         quads=quads,
         measured=measured,
-        turned=HALF_TURN.get(taps, 0.0),
+        turned=HALF_TURN.get(settings[KEY.name], 0.0),
         files=files if one_each else None,
     )
 
@@ -111,7 +121,7 @@ def _stacked(
         why = f"expected one file for each raw frame, found {count} raw frames in "
         why += f"{sum(map(len, patterns))} files"
         raise settings.wrong("source.numbered", why, "leave it out")
-    quads = np.zeros((numbers[-1] + 1, *stored[0].shape), np.float32)
+    quads = np.zeros((numbers[-1] + 1, *stored[0].shape), stored[0].dtype)
     for number in reversed(numbers):
         quads[number] = stored.pop()  # so that the recording is in memory once
     return quads, numbers
@@ -152,8 +162,14 @@ def _in_order(
             by_name = dict(zip(taps, (image for _, image in images), strict=True))
             by_name.pop("A+B", None)  # has no phase
             quads = {tap: decoder(image) for tap, image in by_name.items()}
-            both = {"A", "B"} <= quads.keys()
-            yield images[0][0], quads["A"] - quads["B"] if both else next(iter(quads.values()))
+            yield images[0][0], _quad_of(quads, settings)
+
+
+def _quad_of(taps: dict[str, np.ndarray], settings: Settings) -> np.ndarray:
+    """The quad or the phasor of a raw frame from its taps."""
+    if phasors.are_stored(settings):
+        return phasors.phasor_of(taps, settings)
+    return taps["A"] - taps["B"] if {"A", "B"} <= taps.keys() else next(iter(taps.values()))
 
 
 def _grouped(
