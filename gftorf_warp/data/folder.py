@@ -13,7 +13,7 @@ from . import resources, specs
 from .arrays import as_float32, read_array, read_shape
 from .capture_json import NAME as CAPTURE
 from .problems import Problems
-from .untrusted import FRAMES_MAX
+from .untrusted import FRAMES_MAX, refuse_archive
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
@@ -41,6 +41,7 @@ def format_of(path: Path) -> str:
     if not path.exists():
         raise error("no such folder", "nothing")
     if not path.is_dir():
+        refuse_archive(path)
         raise error("not a folder", "a file")
     found = format_or_none(path)
     if found is not None:

@@ -27,6 +27,42 @@ PACKED_MAX = 1100  # bytes from one byte of a file: deflate packs at most 1032
 # [bytes] that any file may claim, an image of float32: some codecs pack a constant one tighter
 UNPACKED_LEAST = 4 * SIDE_MAX**2
 
+ARCHIVES = {  # first bytes: name
+    b"PK\3\4": "ZIP",
+    b"PK\5\6": "ZIP",
+    b"7z\xbc\xaf": "7-Zip",
+    b"Rar!": "RAR",
+    b"\xfd7zXZ": "xz",
+    b"\x28\xb5\x2f\xfd": "zstd",
+}
+GZIP, BZIP2 = b"\x1f\x8b", b"BZh"  # so short that pixels may begin alike: the name decides too
+TAR_AT, TAR = 257, b"ustar"
+
+
+def refuse_archive(path: Path) -> None:
+    """Refuse an archive in place of a recording: nothing is unpacked, so that none can fill the
+    disk or write outside of its folder. NPZ files are arrays.
+
+    Raises:
+        InputError: If the path is one.
+    """
+    if not path.is_file() or path.suffix.lower() == ".npz":
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(TAR_AT + len(TAR))
+    except OSError as error:
+        raise unreadable(path, error.strerror or str(error)) from error
+    found = next((name for magic, name in ARCHIVES.items() if head.startswith(magic)), None)
+    if head[TAR_AT:] == TAR:
+        found = "tar"
+    if head.startswith((GZIP, BZIP2)) and path.suffix.lower() in (".gz", ".tgz", ".bz2", ".tbz2"):
+        found = "gzip" if head.startswith(GZIP) else "bzip2"
+    if found is not None:
+        why = f"expected the recording itself, found a {found} archive: nothing is unpacked here"
+        fix = "unpack it into a folder of its own and give that, or the file in it"
+        raise InputError("an archive", where=path, why=why, fix=fix)
+
 
 def check_unpacked(claimed: int, packed: int) -> None:
     """Check how many bytes a compressed file of ``packed`` bytes claims to hold.

@@ -11,6 +11,7 @@ from ..data.capture_json import MANIFEST
 from ..data.files import as_errors, atomic_write, refuse_target, sweep, temporary_name
 from ..data.resources import Need, to_import
 from ..data.sequence import Sequence
+from ..data.untrusted import refuse_archive
 from ..data.untrusted import read_text
 from ..data.write import write
 from ..data.writing import refuse_inexpressible
@@ -72,6 +73,7 @@ def read_recording(name: str, source: str | Path, config: str | Path | None = No
     if not source.exists():
         why, fix = "expected a file or folder, found nothing", "check the path"
         raise InputError("no such source", where=source, why=why, fix=fix)
+    refuse_archive(source)
     return kind.read(source, settings)
 
 
