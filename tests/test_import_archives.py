@@ -83,7 +83,7 @@ def test_an_archive_is_refused_and_left_packed(name, tmp_path):
     path.write_bytes(FILES[name])
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="found a .+ archive: nothing is unpacked"):
+        with pytest.raises(InputError, match=r"found a .+ archive: nothing is unpacked"):
             read_recording("ftorf", path)
         peak = tracemalloc.get_traced_memory()[1]
     finally:

@@ -11,8 +11,7 @@ from ..data.capture_json import MANIFEST
 from ..data.files import as_errors, atomic_write, refuse_target, sweep, temporary_name
 from ..data.resources import Need, to_import
 from ..data.sequence import Sequence
-from ..data.untrusted import refuse_archive
-from ..data.untrusted import read_text
+from ..data.untrusted import read_text, refuse_archive
 from ..data.write import write
 from ..data.writing import refuse_inexpressible
 from ..errors import InputError, UsageError
