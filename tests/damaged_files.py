@@ -18,9 +18,11 @@ from pathlib import Path
 
 import cv2
 import foreign
+import kinect2_dump
 import numpy as np
 import recordings
 import test_import_arrays as arrays
+import test_import_colour
 import torf_folder
 from dng import dng
 from ftorf_folder import scene
@@ -209,6 +211,32 @@ IMPORTS = {
     for writer in WRITERS
 }
 READERS |= IMPORTS
+
+
+def make_kinect2(folder):
+    """A packet and all tables of a Kinect v2."""
+    kinect2_dump.write(folder / "dump", lookup=True)
+
+
+def kinect2(folder):
+    """Its quads and lens."""
+    found = read_recording("kinect2", folder / "dump").sequence
+    return [found.quads, repr(found.intrinsics)]
+
+
+def make_colour(folder):
+    """Quads with pictures of a colour camera."""
+    test_import_colour.recorded(folder, test_import_colour.png)
+
+
+def colour(folder):
+    """The pictures and where they were taken."""
+    found = read_recording("arrays", folder / "quads", folder / "keys.toml").sequence.colour
+    return [*found.images.values(), found.camera_from_world]
+
+
+READERS["import kinect2"] = Reader(make=make_kinect2, read=kinect2, damaged="dump/*")
+READERS["import colour"] = Reader(make=make_colour, read=colour, damaged="quads/c/*")
 
 
 @functools.cache
