@@ -388,6 +388,8 @@ def _import(options: argparse.Namespace) -> int:
     out = None if options.dry_run else options.out
     lines = command.import_recording(options.kind, options.source, out, options.config)
     print("\n".join(lines))
+    if options.dry_run:
+        print("nothing is written: --out SEQ in place of --dry-run writes it")
     return 0
 
 
