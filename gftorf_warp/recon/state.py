@@ -90,7 +90,7 @@ def begin(
     if settings.init.kind == Init.PHASE:
         first = from_phase(sequence, settings.init)
     elif settings.init.kind == Init.QUARTETS:
-        first = from_quartets(sequence, settings.init)
+        first = from_quartets(sequence, settings.init, device)
     else:
         first = from_random(sequence, settings.init, generator)
     motion = with_backend(_motion(first, observations, settings, generator).to(device))

@@ -32,10 +32,12 @@ ITERATIONS = 3  # of moving a cluster to the mean of its members
 NOISE_MAX = 0.3  # [m] largest noise of a mean distance that is used
 
 
-def background(sequence: Sequence, change: Change) -> FarLayer:
-    """Distance and amplitude of the farthest surface that each pixel saw at rest."""
+def background(sequence: Sequence, change: Change, device: torch.device | str = "cpu") -> FarLayer:
+    """Distance and amplitude of the farthest surface that each pixel saw at rest, computed on
+    ``device``, in the CPU's memory.
+    """
     sensor = sensor_of(sequence)
-    phasors = decoded_phasors(sequence, change.quartets)  # [f, J, 2, H, W]
+    phasors = decoded_phasors(sequence, change.quartets).to(device)  # [f, J, 2, H, W]
     count = phasors.shape[1]
     values = phasors.transpose(0, 1).flatten(1, 2)  # [J, 2 f, H, W]
     # of one component of a phasor
@@ -51,8 +53,8 @@ def background(sequence: Sequence, change: Change) -> FarLayer:
         return distance_from_phasors([(p[0], p[1]) for p in pairs], sensor)
 
     best = torch.zeros_like(values[0])
-    reach = torch.full(values.shape[2:], -1.0)
-    support = torch.zeros(values.shape[2:], dtype=torch.long)
+    reach = values.new_full(values.shape[2:], -1.0)
+    support = torch.zeros_like(reach, dtype=torch.long)
     for value in values:
         centre = value
         for _ in range(ITERATIONS):
@@ -62,7 +64,7 @@ def background(sequence: Sequence, change: Change) -> FarLayer:
             centre = torch.where(total > 0, mean, centre)
         number = members(centre).sum(dim=0)
         distance = distance_of(centre)
-        amplitude = 0.5 * centre[:2].norm(dim=0)
+        amplitude = 0.5 * torch.hypot(centre[0], centre[1])
         error = distance_noise(amplitude, change.noise, sequence) / number.clamp_min(1).sqrt()
         better = (number >= least) & (error < NOISE_MAX)
         # noise does not decide between two estimates of one surface
@@ -72,10 +74,11 @@ def background(sequence: Sequence, change: Change) -> FarLayer:
         reach = torch.where(better, distance, reach)
         support = torch.where(better, number, support)
     each = torch.stack([distance_of(value) for value in values])
-    amplitudes = 0.5 * values[:, :2].norm(dim=1)
+    amplitudes = 0.5 * torch.hypot(values[:, 0], values[:, 1])
     margin = FARTHER + 4.0 * distance_noise(amplitudes, change.noise, sequence)
     farther = ((each > reach + margin) & (margin < 1.0)).sum(dim=0)
     known = (support > 0) & (farther < max(LEAST, round(CONTRADICTED * count)))
-    fields = torch.stack([reach, 0.5 * best[:2].norm(dim=0)])
+    fields = torch.stack([reach, 0.5 * torch.hypot(best[0], best[1])]).cpu()
+    known = known.cpu()
     distance, amplitude = fill(fields, known)
     return FarLayer(distance=distance, amplitude=amplitude, known=known)

@@ -141,8 +141,13 @@ def _needs_quartet(sequence: Sequence) -> None:
         )
 
 
-def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
-    """A static layer, and moving Gaussians of every quartet, labelled 1 + its number.
+def from_quartets(
+    sequence: Sequence,
+    settings: InitSettings = InitSettings(),
+    device: torch.device | str = "cpu",
+) -> Start:
+    """A static layer, and moving Gaussians of every quartet, labelled 1 + its number; computed on
+    ``device``, in the CPU's memory.
 
     Raises:
         InputError: If no quartet is complete, or the camera moves.
@@ -157,10 +162,10 @@ def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -
             "--set motion.kind=nodes",
         )
     change = change_of(sequence)
-    far = background(sequence, change)
+    far = background(sequence, change, device)
     camera = camera_of(sequence, 0)
     parts, velocities = _static_parts(sequence, change, far, settings), [torch.zeros(0, 3)]
-    for points in moving_points(sequence, change, far, settings.moving_spacing):
+    for points in moving_points(sequence, change, far, settings.moving_spacing, device):
         layer = Layer(mean=points.mean, distance=points.distance, amplitude=points.amplitude)
         label = MOVING + points.quartet
         parts.append(_layer(layer, label, settings.moving_spacing, camera, settings))

@@ -1,14 +1,13 @@
 """Points of moving surfaces, measured in every quartet by itself: distance, amplitude and velocity.
 
-Slot k of a quartet is read where optical flow says that the surface was at that time. Of several
-flows, each pixel takes the one along which one phasor explains the quartet best: opposite quads
-cancel along the right flow. A point moves if the raw frames along its flow differ from the static
-background. Truth is never read.
+Slot k of a quartet is read where a flow says that the surface was at that time; of several flows,
+each pixel takes the one along which one phasor explains the quartet best, see along_flow.py. A
+point moves if the raw frames along its flow differ from the static background. Truth is never read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -17,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data.flow import sample
 from ..data.sequence import Sequence
+from .along_flow import DIFFERS, POOL, REACH, along_best
 from .measured import (
     ROUNDING,
     Change,
@@ -32,16 +31,8 @@ from .sensor import quad_from_phasor
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
-POOL, POOL_DIFFERENCE = 5, 3  # [px] sides of the boxes over which squares are averaged
-# squared difference from the background over noise, from which a raw frame shows something else
-DIFFERS = 4.0
+POOL_DIFFERENCE = 3  # [px] side of the box over which squared differences are averaged
 EXPLAINED = 3.0  # mean squared residual over what is allowed, up to which a flow is right
-RELATIVE = 0.1  # allowed share of the amplitude: phase and amplitude change during a quartet
-# penalties of a flow: towards the background, and of a translation beside optical flow
-TO_BACKGROUND, TRANSLATED = 4.0, 0.3
-GAIN = 0.8  # a later candidate must have less than this share of the score
-REACH = 0.08  # [width] largest translation during a quartet
-STEPS = 6  # translations from the middle to the reach
 NOISE_MAX = 0.25  # [m] largest noise of a distance that is used
 NEARER = 0.02  # [m] least distance in front of the background
 RADIAL_MAX = 0.5  # [m] largest change of distance from one quartet to the next
@@ -64,20 +55,23 @@ class MovingPoints:
 
 
 def moving_points(
-    sequence: Sequence, change: Change, background: FarLayer, spacing: float
+    sequence: Sequence,
+    change: Change,
+    background: FarLayer,
+    spacing: float,
+    device: torch.device | str = "cpu",
 ) -> Iterator[MovingPoints]:
-    """The points, ``spacing`` pixels apart, of every complete quartet of a static camera; nothing
-    if there is one alone, in which nothing can be seen to change.
+    """The points, ``spacing`` pixels apart, of every complete quartet of a static camera, decoded
+    on ``device``; nothing if there is one alone, in which nothing can be seen to change.
     """
     if len(change.quartets) < 2:
         return
-    quads = _quads_of(sequence, background)
+    quads, where = _quads_of(sequence, background), torch.device(device)
 
     def decoded(quartet: int) -> _Decoded:
-        return _decoded(sequence, quartet, change, background, quads)
+        return _decoded(sequence, quartet, change, background, quads, where)
 
-    with ThreadPoolExecutor(thread_name_prefix="gftorf-points") as threads:
-        by_quartet = dict(zip(change.quartets, threads.map(decoded, change.quartets), strict=True))
+    by_quartet = dict(zip(change.quartets, _mapped(decoded, change.quartets, where), strict=True))
     camera, size = camera_of(sequence, 0), (sequence.width, sequence.height)
     keys = key_times(sequence).tolist()
     columns, rows = (
@@ -120,6 +114,23 @@ class _Decoded:
     """Whether the other images are those of a moving surface."""
 
 
+def _mapped(
+    decoded: Callable[[int], _Decoded], quartets: Iterable[int], device: torch.device
+) -> list[_Decoded]:
+    """Every quartet decoded: on a CPU by a thread each, as many as torch may use, so that no result
+    depends on their number.
+    """
+    if device.type != "cpu":
+        return list(map(decoded, quartets))
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(count, thread_name_prefix="gftorf-points") as threads:
+            return list(threads.map(decoded, quartets))
+    finally:
+        torch.set_num_threads(count)
+
+
 def _quads_of(sequence: Sequence, background: FarLayer) -> Float[np.ndarray, "K H W"]:
     """Quads of the background in every slot."""
     sensor, slots = sensor_of(sequence), slice(0, sequence.cycle)
@@ -140,12 +151,12 @@ def _decoded(
     change: Change,
     background: FarLayer,
     background_quads: Float[np.ndarray, "K H W"],
+    device: torch.device,
 ) -> _Decoded:
     """Decode a quartet along the best of several flows, inside the box that holds all changes."""
     import cv2
 
-    frames = sequence.quartet_frames(quartet)
-    quads = sequence.quads[frames].astype(np.float32)
+    quads = sequence.quads[sequence.quartet_frames(quartet)].astype(np.float32)
     least = max(ROUNDING * float(background.amplitude.max()), 1e-12)
     noise, shape = max(change.noise, least), quads.shape[1:]
     differs = _pooled(np.square((quads - background_quads) / noise), POOL_DIFFERENCE)
@@ -159,141 +170,18 @@ def _decoded(
     )
     if box is None:
         return whole
-    best = _Best()
-    slots = _Slots.of(sequence, quartet)
-    images = np.stack([quads, differs], axis=1)[..., box[0], box[1]]
-    for candidate, translated in _flows(sequence, quartet, slots):
-        flow = candidate[:, box[0], box[1]]
-        along = np.stack(
-            [sample(i, flow, share) for i, share in zip(images, slots.share, strict=True)]
-        )
-        phasors, squares = slots.phasors(along[:, 0])
-        amplitude = 0.5 * np.hypot(*phasors[0])
-        allowed = noise**2 + np.square(RELATIVE * amplitude)
-        residual = _pooled((squares / allowed)[None], POOL)[0]
-        # all raw frames but one: a surface may look like the background in one slot
-        moves = np.sort(along[:, 1], axis=0)[1] > DIFFERS
-        score = residual + np.where(moves, 0.0, TO_BACKGROUND) + TRANSLATED * translated
-        best.update(score, [residual, moves, *flow, *phasors.reshape(-1, *residual.shape)])
-    residual, moves, fx, fy, *parts = best.images
-    pairs = torch.as_tensor(np.stack(parts)).unflatten(0, (-1, 2))
-    distance = distance_from_phasors([(p[0], p[1]) for p in pairs], sensor_of(sequence)).numpy()
-    amplitude = 0.5 * np.hypot(*parts[:2])
-    deviation = distance_noise(torch.as_tensor(amplitude), noise, sequence).numpy()
-    moving = (moves > 0) & (residual < EXPLAINED) & (deviation < NOISE_MAX)
+    images = np.stack([quads, differs])[..., box[0], box[1]]
+    best = along_best(sequence, quartet, torch.as_tensor(images, device=device), box, noise)
+    phasors = [(re, im) for re, im in best.phasors.cpu()]
+    distance = distance_from_phasors(phasors, sensor_of(sequence)).numpy()
+    amplitude = 0.5 * torch.hypot(*phasors[0])
+    deviation = distance_noise(amplitude, noise, sequence).numpy()
+    moving = (best.moves & (best.residual < EXPLAINED)).cpu().numpy() & (deviation < NOISE_MAX)
     moving &= distance < background.distance.numpy()[box] - NEARER
-    whole.flow[:, box[0], box[1]] = fx, fy
-    whole.distance[box], whole.amplitude[box] = distance, amplitude
+    whole.flow[:, box[0], box[1]] = best.flow.cpu().numpy()
+    whole.distance[box], whole.amplitude[box] = distance, amplitude.numpy()
     whole.moving[box] = cv2.medianBlur(moving.astype(np.uint8), 3) > 0
     return whole
-
-
-class _Best:
-    """The images of the best candidate of every pixel."""
-
-    def __init__(self):
-        self.images: list[np.ndarray] = []
-        self._score = np.zeros(0)
-
-    def update(self, score: np.ndarray, images: list[np.ndarray]) -> None:
-        """Take the pixels in which a candidate is clearly better."""
-        if not self.images:
-            self._score, self.images = score, [np.array(i, dtype=np.float32) for i in images]
-            return
-        better = score < GAIN * self._score
-        for old, new in zip((self._score, *self.images), (score, *images), strict=True):
-            old[better] = new[better]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Slots:
-    """Raw frames of a quartet: when they were taken, and the phasor that explains them best."""
-
-    share: Float[np.ndarray, "K"]
-    """Time from the middle of the quartet, in units of its duration; 0 if all have one time."""
-    groups: list[tuple[Bool[np.ndarray, "K"], Float[np.ndarray, "k m"]]]
-    """Raw frames of each frequency, and their model: quads = model @ (re, im, perhaps constant)."""
-
-    @property
-    def free(self) -> int:
-        """Degrees of freedom of the residual of :meth:`phasors`."""
-        return sum(model.shape[0] - model.shape[1] for _, model in self.groups)
-
-    @property
-    def decide(self) -> bool:
-        """Whether one flow may explain the raw frames better than another: not those of three
-        shifts, nor those that have one time, as those of a phasor.
-        """
-        return self.free > 0 and bool(self.share.any())
-
-    @classmethod
-    def of(cls, sequence: Sequence, quartet: int) -> _Slots:
-        frames = sequence.quartet_frames(quartet)
-        times, shifts = sequence.times[frames], sequence.shifts[frames]
-        duration = (times[-1] - times[0]) * len(times) / (len(times) - 1)
-        constant = float(sequence.calibration.dc_offset) != 0.0
-        groups = []
-        for f in sequence.frequencies:
-            mask = sequence.frame_frequencies[frames] == f
-            columns = [np.cos(shifts[mask]), np.sin(shifts[mask])]
-            if constant or mask.sum() == 3:
-                columns.append(np.ones(mask.sum()))
-            groups.append((mask, np.stack(columns, axis=1).astype(np.float32)))
-        at_once = sequence.from_phasors or duration == 0.0
-        share = np.zeros(len(times)) if at_once else (times - times.mean()) / duration
-        return cls(share=share, groups=groups)
-
-    def phasors(
-        self, quads: Float[np.ndarray, "K H W"]
-    ) -> tuple[Float[np.ndarray, "f 2 H W"], Float[np.ndarray, "H W"]]:
-        """Phasors by least squares, and the mean squared residual per degree of freedom, zero if
-        there is none.
-        """
-        phasors, squares = [], np.zeros(quads.shape[1:], np.float32)
-        for mask, model in self.groups:
-            values = quads[mask]
-            fitted = np.tensordot(np.linalg.pinv(model), values, axes=1)
-            if model.shape[0] > model.shape[1]:
-                squares += np.square(values - np.tensordot(model, fitted, axes=1)).sum(axis=0)
-            phasors.append(2.0 * fitted[:2])
-        return np.stack(phasors), squares / max(self.free, 1)
-
-
-def _flows(
-    sequence: Sequence, quartet: int, slots: _Slots
-) -> Iterator[tuple[Float[np.ndarray, "2 H W"], bool]]:
-    """Candidates of the displacement during a quartet of what is there in its middle, and whether
-    each is a translation of the whole image: no motion, optical flow between the starts of
-    neighbouring quartets, and translations.
-
-    No motion comes after optical flow if the raw frames fit every flow equally well.
-    """
-    cycle, size = sequence.cycle, (2, sequence.height, sequence.width)
-    forward, backward = sequence.flow.forward, sequence.flow.backward
-    still = np.zeros(size, np.float32)
-    if slots.decide:
-        yield still, False
-    middle = 0.5 if slots.share.any() else 0.0  # phasors are those of the start
-    # flow from the start of a quartet, and its sign
-    for flows, step, sign in (
-        (forward, 0, 1.0),
-        (backward, 1, -1.0),
-        (backward, 0, -1.0),
-        (forward, -1, 1.0),
-    ):
-        if cycle * (quartet + step) in flows:
-            flow = sign * np.nan_to_num(flows[cycle * (quartet + step)]).astype(np.float32)
-            yield sample(flow, flow, step - middle), False
-            yield flow, False
-    if not slots.decide:
-        yield still, False
-    pitch = max(REACH * sequence.width / STEPS, 1.0)
-    grid = np.arange(-STEPS, STEPS + 1)
-    for y in grid:
-        for x in grid:
-            if 0 < np.hypot(x, y) <= STEPS + 0.5:
-                translation = np.array([pitch * x, pitch * y], np.float32)[:, None, None]
-                yield np.broadcast_to(translation, size), True
 
 
 def _radial(
