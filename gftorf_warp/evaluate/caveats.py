@@ -23,7 +23,12 @@ def caveats(config: Mapping[str, Any], sequence: Sequence, truth: Truth | None) 
         sequence: What the run was made from.
         truth: What it is scored against; None: unknown.
     """
-    found = [_damaged(config), _edited(config), _beyond_range(sequence, truth)]
+    found = [
+        _damaged(config),
+        _edited(config),
+        _tried_again(config),
+        _beyond_range(sequence, truth),
+    ]
     texts = [text for text in found if text]
     for text in texts:
         LOG.warning("%s", text)
@@ -43,6 +48,20 @@ def _edited(config: Mapping[str, Any]) -> str:
     """About a run that no command makes again."""
     source = config.get("edited_from")
     return f"Its Gaussians were edited after the reconstruction in {source}." if source else ""
+
+
+def _tried_again(config: Mapping[str, Any]) -> str:
+    """About a fit that failed, and the one that followed it."""
+    attempts = config.get("attempts")
+    if not attempts:
+        return ""
+    each = ", ".join(
+        f"{one['start']}: {100 * (one['unexplained_share'] or 0.0):.2g} % of the pixels are not "
+        "explained"
+        for one in attempts
+    )
+    kept = next(one["attempt"] for one in attempts if one["kept"])
+    return f"The first fit failed and was repeated from another start ({each}); fit {kept} stays."
 
 
 def _beyond_range(sequence: Sequence, truth: Truth | None) -> str:

@@ -19,7 +19,7 @@ Styles = Mapping[str, tuple[str, str]]
 OF_DISTANCES: Styles = {name: (COLOURS[name], NAMES[name]) for name in COLOURS}
 TERM_COLOURS = "#0072b2 #e69f00 #009e73 #cc79a7 #56b4e9 #d55e00 #8c6d31 #666666".split()
 # what else a log step holds
-NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}
+NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity", "attempt"}
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
 BINS = 59
 IMAGES = "optimised images"

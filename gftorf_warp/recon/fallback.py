@@ -9,7 +9,8 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
 * the *closed form* of the quartet where no other one measured the same, the fit does not explain
   its raw frames (see residuals.py), and one phasor explains them better: nothing moved within it.
   What moved can look like one phasor by chance, at a distance that no neighbour has: there it has
-  to explain them still better.
+  to explain them still better. A fit that explains no more than black images do is replaced
+  wherever it fails.
 
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
 a fit between the two sides stays if it explains the quads.
@@ -40,6 +41,7 @@ from ..scene.camera import Camera
 from ..scene.measured import extremes
 from ..scene.sensor import quad_from_phasor
 from . import closed_form
+from .collapse import NEAR
 from .residuals import Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
@@ -107,6 +109,7 @@ class Fallback:
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
         needed = np.where(_supported(alone), odds, odds**2)
+        needed = np.where(_is_useless(found, sequence, noise), 0.0, needed)
         moved = (
             ~agrees & (count == 1) & ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
         )
@@ -167,6 +170,12 @@ def _odds(wrong: float | None, found: Residuals) -> float:
     wrong = found.unexplained_share if wrong is None else wrong
     low, high = ODDS
     return min(max((1.0 - wrong) / max(wrong, 1.0 / high), low), high)
+
+
+def _is_useless(found: Residuals, sequence: Sequence, noise: QuadNoise) -> bool:
+    """Whether a fit explains the quads no better than black images do: it failed as a whole."""
+    black = _chi_square(sequence, np.zeros_like(temporal.stacked_quads(sequence)), noise)
+    return not found.chi_square.mean(dtype=float) < (1.0 - NEAR) * black.mean(dtype=float)
 
 
 def _between(

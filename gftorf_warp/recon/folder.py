@@ -72,6 +72,7 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     return True
 
 
+MAY_GROW = ("schedule.images", "attempts_max")
 # the last until 0.1.0
 CHANGES_NOTHING = ("render.threads", "schedule.checkpoint_every_s", "graph", "kernels")
 
@@ -91,7 +92,7 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
     for key in sorted({*flat_old, *flat_new}):
         before, after = flat_old.get(key), flat_new.get(key)
         if (
-            key == "schedule.images"
+            key in MAY_GROW
             and isinstance(before, int)
             and isinstance(after, int)
             and after >= before

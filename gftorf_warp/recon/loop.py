@@ -149,7 +149,7 @@ class TrainingLoop:
         """Write one row of metrics: means over the images since the last one."""
         row = row_of_sums(state, self.peak, self.clock())
         if row is not None:
-            self.metrics.add(row)
+            self.metrics.add(row | ({} if state.attempt == 1 else {"attempt": state.attempt}))
             if self.progress is not None:
                 shown = {name: row[key] for name, key in SHOWN.items()}
                 self.progress(state.images, self.settings.schedule.images, **shown)
@@ -160,6 +160,7 @@ class TrainingLoop:
         seed = self.seed + SEED_STEP * number
         fresh = begin(self.observations, self.settings, seed=seed, device=self.device)
         fresh.restarts, fresh.skipped, fresh.rollbacks = number, state.skipped, state.rollbacks
+        fresh.attempt, fresh.judged, fresh.other = state.attempt, state.judged, state.other
         for rows in (self.metrics, self.diagnostics):
             rows.rewind(-1)
         self.save(fresh)

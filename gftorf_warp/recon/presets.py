@@ -82,7 +82,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
     both started from measured phase. A moving camera has nodes instead, as ``demo`` has.
     """
     if recorded.camera_moves:
-        return replace(demo(recorded), preset="best", fallback=True, outlines=True)
+        return replace(demo(recorded), preset="best", fallback=True, outlines=True, attempts_max=2)
     rates = Rates(
         mean=1e-3,
         log_scale=3e-2,
@@ -109,6 +109,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         background=0.3,
         fallback=True,
         outlines=True,
+        attempts_max=2,
     )
 
 

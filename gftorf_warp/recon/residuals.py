@@ -40,6 +40,7 @@ MODEL_ERROR = 0.05  # [1] of the amplitude: 6 cm at 20 MHz
 TINY = 1e-30  # [quad units^2] instead of no variance
 # Limits of shares of pixels; in brackets a good fit (`gftorf demo`), and bad ones of random scenes
 UNEXPLAINED_MAX = 0.02  # of all (0.008; 0.03 to 0.11)
+FAILED_MIN = 0.05  # of all, of a fit that failed (0.08 to 0.17 injected; good ones at most 0.03)
 CHANGING_MAX = 0.5  # of those that change, unexplained (0.1; 0.7)
 CONTRADICTED_MAX = 0.05  # of those that do not, at another distance (0.004; 0.13)
 CHANGING_MIN = 1e-3  # of all: noise alone makes 2e-4 of the pixels change
@@ -251,7 +252,16 @@ def warn(found: Residuals | None) -> None:
         LOG.warning("%s", problem)
 
 
-def problems(found: Mapping[str, Any] | None) -> list[str]:
+def failures(found: Mapping[str, Any] | None) -> list[str]:
+    """Those of :func:`problems` by which a fit failed: all, unless only a few pixels are not
+    explained.
+    """
+    return problems(found, unexplained_max=FAILED_MIN)
+
+
+def problems(
+    found: Mapping[str, Any] | None, *, unexplained_max: float = UNEXPLAINED_MAX
+) -> list[str]:
     """What is wrong with a run, in sentences, from :meth:`Residuals.as_json`; the same limits for
     every preset. Opaque veils, dead networks, wrong or missing motion and layers at false distances
     all show here.
@@ -259,7 +269,7 @@ def problems(found: Mapping[str, Any] | None) -> list[str]:
     if found is None:
         return []
     sentences = []
-    if found["unexplained_share"] > UNEXPLAINED_MAX:
+    if found["unexplained_share"] > unexplained_max:
         text = f"the fit does not explain {found['unexplained_share']:.1%} of the pixels"
         if found["reduced_chi_square"] is not None:
             text += f" (reduced chi-square of the quads {found['reduced_chi_square']:.3g})"

@@ -323,12 +323,16 @@ class ReconSettings:
     outlines: bool = False
     """Whether mixed pixels of the finished run have the distance of the surface at their centre,
     see recon/outlines.py; the optimisation is the same."""
+    attempts_max: int = 1
+    """Fits of a run, 1 or 2: one that its residuals call failed is followed by another one from
+    another start, and the better one stays, see recon/attempts.py."""
     restarts_max: int = 3
     """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 
     def __post_init__(self):
         require(self, "scale_max", "quad_scale", "motion_gradient_max", above=0)
         require(self, "width_max", "failures_max", at_least=1)
+        require(self, "attempts_max", at_least=1, at_most=2)
         require(self, "background", "rollbacks_max", "restarts_max", at_least=0)
         if self.motion.kind not in KINDS:
             raise ValueError(

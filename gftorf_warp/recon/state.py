@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -50,6 +52,8 @@ class Progress:
     """How often it was."""
     unseen_at: int = 0
     """Optimised images at the last visibility pruning."""
+    attempt: int = 1
+    """Number of the attempt, see attempts.py."""
 
 
 PROGRESS = [field.name for field in fields(Progress)]
@@ -75,6 +79,10 @@ class State(Progress):
     """Batches still to be drawn in this epoch."""
     sums: dict[str, Tensor]
     """Loss terms and others, summed over the images since the last logged row."""
+    judged: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    """Attempts that ended and failed, or were compared with one that had, see attempts.py."""
+    other: dict[str, Any] | None = None
+    """In a second attempt: state and rows at the end of the first."""
 
 
 def begin(
@@ -142,6 +150,8 @@ def to_dict(state: State) -> dict[str, object]:
         "noise_seed": state.noise_seed,
         "queue": list(state.queue),
         "sums": dict(state.sums),
+        "judged": list(state.judged),
+        "other": state.other,
         **{name: getattr(state, name) for name in PROGRESS},
     }
 
@@ -173,6 +183,8 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
         noise_seed=_noise_seed(stored),
         queue=list(stored["queue"]),
         sums={name: value.to(device) for name, value in stored["sums"].items()},
+        judged=list(stored.get("judged", [])),
+        other=stored.get("other"),
         **progress,
     )
 

@@ -22,7 +22,7 @@ from ..render.cuda import free_memory, on_device
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
-from . import checkpoint, closed_form, folder, presets, residuals, source
+from . import attempts, checkpoint, closed_form, folder, presets, residuals, source
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -270,13 +270,12 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         LOG.info("%s is finished: a closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
-    total = settings.schedule.images
-    if stored is not None and stored["images"] >= total:
+    if _is_finished(stored, settings, out):
         if sequence.path is not None:  # it may have moved
             source.remember(out, sequence.path)
         known = folder.read_config(out)
         if "explained" not in known:  # the process was killed after the last checkpoint
-            _conclude(sequence, out, known, stored, device)
+            _conclude(out, known, stored, _judged(sequence, out, device))
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     if settings.method.is_volume:
@@ -298,47 +297,67 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     }
     given = observations, settings, out, stored
     more = {"seed": seed, "clock": clock, "progress": progress}
+    state: VolumeState | State
     if settings.method.is_volume:
         config |= fit.describe(settings, config["changes"])
         folder.write_config(out, config)
-        state: VolumeState | State = fit.fit(*given, **more)
+        state = fit.fit(*given, **more)
+        found = _judged(sequence, out, device)
     else:
         folder.write_config(out, config)
-        state = _fit_gaussians(sequence, *given, **more)
+        state, found = _fit_gaussians(sequence, *given, **more)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
-    _conclude(sequence, out, config, vars(state), device)
+    _conclude(out, config, vars(state), found)
+
+
+def _judged(
+    sequence: Sequence, out: Path, device: torch.device | str
+) -> residuals.Residuals | None:
+    """Residuals of what is stored in the folder of a run."""
+    return residuals.residuals(Run.open(out, device), sequence)
 
 
 def _conclude(
-    sequence: Sequence,
     out: Path,
     config: dict[str, Any],
     state: Mapping[str, Any],
-    device: torch.device | str,
+    found: residuals.Residuals | None,
 ) -> None:
-    """Write what config.json says of a finished run, by its state at the end."""
+    """Write what config.json says of a finished run, by its state and residuals at the end."""
     config |= {"seconds_reconstruct": state["seconds"], "images_optimised": state["images"]}
     config |= {name: state[name] for name in ("skipped", "restarts", "revivals") if name in state}
-    folder.write_config(out, config)
-    found = residuals.residuals(Run.open(out, device), sequence)
+    if state.get("judged"):
+        config["attempts"] = attempts.as_json(state["judged"], state["attempt"])
     residuals.warn(found)
     folder.write_config(out, config | {"explained": found and found.as_json()})
 
 
+def _is_finished(stored: dict | None, settings: ReconSettings, out: Path) -> bool:
+    """Whether nothing is left to train: all images are used up, and no other attempt may follow."""
+    if stored is None or stored["images"] < settings.schedule.images:
+        return False
+    return settings.attempts_max == 1 or "explained" in folder.read_config(out)
+
+
 def _fit_gaussians(
     sequence, observations, settings, out, stored, *, seed, clock, progress
-) -> State:
-    """Train Gaussians until the images of the settings are used up."""
+) -> tuple[State, residuals.Residuals | None]:
+    """Train Gaussians until the images of the settings are used up, in as many attempts as it
+    takes; the state that stays, and its residuals.
+    """
     device, total = observations.quads.device, settings.schedule.images
+
+    def begun(number: int) -> State:
+        chosen, of_attempt = attempts.settings_of(settings, number), attempts.seed_of(seed, number)
+        return begin(observations, chosen, seed=of_attempt, device=device)
+
     if stored is None:
-        state = begin(observations, settings, seed=seed, device=device)
+        state = begun(1)
     else:
         with checkpoint.rebuilding(out):
             state = from_dict(stored, device)
     metrics = Metrics(out / "metrics.jsonl")
     diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
-    for rows in (metrics, diagnostics):
-        rows.rewind(state.images or -1)  # the row of the start is written once more
     verb = "starts at" if stored is None else "goes on at"
     layer = state.optimiser.layer
     moving = 0 if layer is None else int((layer > 0).sum())
@@ -347,10 +366,21 @@ def _fit_gaussians(
     if total <= (warm_up := settings.schedule.warm_up):
         text = "nothing will move: the warm-up takes %d images, the run %d"
         LOG.warning(text, warm_up, total)
-    if torch.device(device).type == "cpu":  # a thread per image: no result depends on their number
-        settings = replace(settings, render=replace(settings.render, threads=1))
-    records = metrics, diagnostics, clock, progress
-    return TrainingLoop(observations, settings, seed, out, *records).run(state)
+
+    def train(state: State) -> State:
+        for rows in (metrics, diagnostics):
+            rows.rewind(state.images or -1)  # the row of the start is written once more
+        chosen = attempts.settings_of(settings, state.attempt)
+        if device.type == "cpu":  # a thread per image: no result depends on their number
+            chosen = replace(chosen, render=replace(chosen.render, threads=1))
+        records = metrics, diagnostics, clock, progress
+        first = attempts.seed_of(seed, state.attempt)
+        return TrainingLoop(observations, chosen, first, out, *records).run(state)
+
+    def judge() -> residuals.Residuals | None:
+        return _judged(sequence, out, device)
+
+    return attempts.run(state, settings, out, train=train, begin=begun, judge=judge)
 
 
 def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, object]:

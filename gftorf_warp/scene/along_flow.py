@@ -132,7 +132,8 @@ class Slots:
         times, shifts = sequence.times[frames], sequence.shifts[frames]
         duration = (times[-1] - times[0]) * len(times) / (len(times) - 1)
         constant = float(sequence.calibration.dc_offset) != 0.0
-        fit, rest = [], []
+        fit: list[np.ndarray] = []
+        rest: list[np.ndarray] = []
         for f in sequence.frequencies:
             mask = sequence.frame_frequencies[frames] == f
             columns = [np.cos(shifts[mask]), np.sin(shifts[mask])]
