@@ -5,13 +5,16 @@
         [--size 320x240] [--frames 60] [--images N] [--device cpu] [--workers K]
         [--limit SECONDS] [--again] [--keep]
     python benchmarks/accuracy.py --out DIR --row fast --row plane=fast,weights.ssim=0.1
+    python benchmarks/accuracy.py --out DIR --rows benchmarks/best_rows.txt --flow
 
-A row is NAME=PRESET[,SETTING=VALUE...], or a preset alone. Scenes are `gftorf simulate random-N
---engine mesh`: numbers 0 to 15 are for tuning. Those of --validation, 100 to 115, are looked at for
-closing tables only; no setting is chosen with them. --shared adds the sequences in a folder that
-other programs made, in the F-ToeRF layout; --finer names the same ones at a multiple of their size,
-whose truth gives their edge floor. --images shortens every preset to that many images, and
-all its intervals alike.
+A row is NAME=PRESET[,SETTING=VALUE...], or a preset alone; --rows names a file with one in each
+line. Rows that differ in ``fallback`` and ``outlines`` alone share their fits. Scenes are `gftorf
+simulate random-N --engine mesh`: numbers 0 to 15 are for tuning. Those of --validation, 100 to 115,
+are looked at for closing tables only; no setting is chosen with them. --flow computes the optical
+flow of a scene once instead of in every fit: the same, for presets that keep its size. --shared
+adds the sequences in a folder that other programs made, in the F-ToeRF layout; --finer names the
+same ones at a multiple of their size, whose truth gives their edge floor. --images shortens every
+preset to that many images, and all its intervals alike.
 
 Results are lines in DIR/results.jsonl, one per scene and per fit. What is there with the same
 settings and data is not repeated, so the same command continues after an interruption or --limit,
@@ -31,13 +34,14 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import accuracy_table as table
 import cv2
 import numpy as np
 import torch
-from accuracy_jobs import Job, Result, Row, Setup, Work, failure, picture_of
+from accuracy_jobs import Job, Result, Row, Setup, Task, Work, failure, picture_of
 
 import gftorf_warp
 from gftorf_warp.sweep.command import read_results
@@ -62,6 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
         device=options.device,
         keep=options.keep,
         finer=options.finer and options.finer.resolve(),
+        flow=options.flow,
     )
     setup.out.mkdir(parents=True, exist_ok=True)
     sets = _sets(options)
@@ -85,14 +90,12 @@ def main(arguments: list[str] | None = None) -> int:
     with Workers(places(devices, options.workers), Work(setup)) as workers:
         for jobs in (scenes, fits):
             done = 0
-            tasks = [(job, known.get(job.id(setup))) for job in jobs]
-            for (job, _), outcome in workers.outcomes(
-                tasks, tries=1, deadline=begun + options.limit
-            ):
-                done += 1
+            tasks = _tasks((job, known.get(job.id(setup))) for job in jobs)
+            for task, outcome in workers.outcomes(tasks, tries=1, deadline=begun + options.limit):
+                done += len(task)
                 lost = isinstance(outcome, Lost)
-                result = failure(job, setup, outcome.why) if lost else outcome
-                if result is not None:
+                results = [failure(job, setup, outcome.why) for job, _ in task] if lost else outcome
+                for result in filter(None, results):
                     result["source"] = source
                     stored[result["id"]] = result
                     with store.open("a", encoding="utf-8") as file:
@@ -109,12 +112,30 @@ def main(arguments: list[str] | None = None) -> int:
     return int(any("error" in result for result in found))
 
 
+def _tasks(jobs: Iterable[tuple[Job, str | None]]) -> list[Task]:
+    """Jobs with the keys of their known results, those of one fit together."""
+    found: dict[object, list[tuple[Job, str | None]]] = {}
+    for job, known in jobs:
+        fit = job.scene, job.row and job.row.fit, job.seed
+        found.setdefault(fit, []).append((job, known))
+    return [tuple(each) for each in found.values()]
+
+
+def rows_of(path: str) -> list[Row]:
+    """The rows in a file, one in each line; what follows # is a comment."""
+    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    texts = (line.partition("#")[0].strip() for line in lines)
+    return [Row.of(text) for text in texts if text]
+
+
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--row", dest="rows", type=Row.of, action="append", required=True)
+    parser.add_argument("--row", dest="rows", type=Row.of, action="append", default=[])
+    parser.add_argument("--rows", dest="listed", type=rows_of, default=[], metavar="FILE")
+    parser.add_argument("--flow", action="store_true", help="compute flow with the scenes")
     parser.add_argument("--scenes", type=numbers, help="tuning scenes, like 0-3,7 or none (0-15)")
     parser.add_argument("--validation", action="store_true", help="scenes 100 to 115 instead")
     parser.add_argument("--shared", type=Path, help="folder of further sequences")
@@ -135,6 +156,9 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         parser.error("--scenes names tuning scenes; --validation takes all of its own")
     if not set(options.scenes or []) <= set(TUNING):
         parser.error(f"--scenes: tuning scenes are 0 to {TUNING[-1]}")
+    options.rows = [*options.rows, *options.listed]
+    if not options.rows:
+        parser.error("there is no row: use --row or --rows")
     names = [row.name for row in options.rows]
     if len(set(names)) < len(names):
         parser.error(f"--row: each row needs a name of its own, got {', '.join(names)}")

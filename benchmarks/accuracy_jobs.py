@@ -1,9 +1,10 @@
 """The jobs of benchmarks/accuracy.py and the processes that do them.
 
 A job prepares a scene (simulates it if its folder lacks it, and computes its edge floor) or fits a
-row of the table to it with one seed and scores the fit. Its result is a dictionary for one line of
-JSON. Every worker is a process that imports everything once; if a job raises, or kills its process,
-its result is the error.
+row of the table to it with one seed and scores the fit. Jobs that differ only in what is done after
+a fit are one task, with one fit. The result of a job is a dictionary for one line of JSON. Every
+worker is a process that imports everything once; if a job raises, its result is the error, and so
+it is for all jobs of a task that kills its process.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import warp as wp
 
 from gftorf_warp import Sequence, compare, reconstruct, simulate
 from gftorf_warp.data.decode import closed_form_distance, unambiguous_range
+from gftorf_warp.data.flow import compute_flow
 from gftorf_warp.data.read import read, read_truth
 from gftorf_warp.data.texts import read_rows
 from gftorf_warp.data.truth import known_distance, moving_and_static
@@ -46,6 +48,7 @@ from gftorf_warp.sweep.workers import Place
 
 Result = dict[str, Any]
 RAYS = 4  # per pixel and axis, of the edge floor
+AFTER_FIT = ("fallback", "outlines")  # settings of the finished run, which change no fit
 CAPTION, PANEL = 16, 240  # [px] height of the text above a picture, least width of each of its four
 
 
@@ -59,6 +62,12 @@ class Row:
     """Name of the preset."""
     changes: tuple[str, ...] = ()
     """Single settings, as ``--set`` takes them."""
+
+    @property
+    def fit(self) -> tuple[str, ...]:
+        """What its fits depend on: rows of equal ones share them."""
+        mine = (one for one in self.changes if one.partition("=")[0].strip() not in AFTER_FIT)
+        return self.preset, *mine
 
     @classmethod
     def of(cls, text: str) -> Row:
@@ -87,6 +96,8 @@ class Setup:
     """Where to trace and to fit."""
     keep: bool = False
     """Whether the folders of runs are kept."""
+    flow: bool = False
+    """Whether the optical flow of simulated scenes is computed with them, once for all fits."""
     finer: Path | None = None
     """Folder with given sequences of the same names at a multiple of their size, for their edge
     floor; None: they have none."""
@@ -135,6 +146,36 @@ class Job:
         return int(self.scene.partition("-")[2])
 
 
+Task = tuple[tuple[Job, str | None], ...]
+
+
+class Fits:
+    """Runs of the jobs of one task, whose folders :meth:`clear` removes unless they are kept."""
+
+    def __init__(self, setup: Setup):
+        self.setup = setup
+        self._runs: dict[ReconSettings, Run] = {}
+
+    def run(self, job: Job, sequence: Sequence, settings: ReconSettings) -> Run:
+        """The run of a job with its settings; its fit is one from before, if there is an equal."""
+        alike = replace(settings, **dict.fromkeys(AFTER_FIT, False))
+        if alike not in self._runs:
+            folder = self.setup.out / "runs" / job.id(self.setup).replace("/", "_")
+            shutil.rmtree(folder, ignore_errors=True)
+            if torch.device(self.setup.device).type == "cuda":
+                torch.cuda.reset_peak_memory_stats(self.setup.device)
+            given = {"seed": job.seed, "device": self.setup.device}
+            self._runs[alike] = reconstruct(sequence, folder, settings, **given)
+        run = self._runs[alike]
+        return replace(run, config={**run.config, "settings": plain(settings)})
+
+    def clear(self) -> None:
+        """Remove the folders."""
+        for run in self._runs.values() if not self.setup.keep else ():
+            shutil.rmtree(run.path, ignore_errors=True)
+        self._runs.clear()
+
+
 def settings_of(sequence: Sequence, row: Row, images: int | None) -> ReconSettings:
     """The settings of a row for a sequence: its preset, shortened to ``images``, then changed."""
     kind = input_of(sequence, Input.AUTO)
@@ -147,10 +188,13 @@ def settings_of(sequence: Sequence, row: Row, images: int | None) -> ReconSettin
     return changed(settings, row.changes, CHANGES)
 
 
-def result_of(job: Job, setup: Setup, known: str | None) -> Result | None:
+def result_of(job: Job, setup: Setup, known: str | None, fits: Fits | None = None) -> Result | None:
     """Do a job; None if its result, of key ``known``, is still that of these settings and data."""
     begun = time.monotonic()
-    result = (_prepared if job.row is None else _fitted)(job, setup, known)
+    if job.row is None:
+        result = _prepared(job, setup, known)
+    else:
+        result = _fitted(job, setup, known, fits or Fits(setup))
     if result is None:
         return None
     return {"id": job.id(setup), "scene": job.title, "seed": job.seed, **result} | {
@@ -165,6 +209,8 @@ def _prepared(job: Job, setup: Setup, known: str | None) -> Result | None:
         scene = random_scene(job.number)
         how = {"size": setup.size, "frames": setup.frames, "engine": "mesh", "seed": job.number}
         simulate(scene, folder, device=setup.device, **how)
+        if setup.flow:
+            _store_flow(folder)
         about = f"{scene.motion}; {scene.description}"
     sequence = _sequence(folder)
     finer = None if setup.finer is None else setup.finer / folder.name
@@ -187,6 +233,19 @@ def _prepared(job: Job, setup: Setup, known: str | None) -> Result | None:
     return {"key": key, "floor": floor, "about": about, "moving_share": float(moving.mean())}
 
 
+def _store_flow(folder: Path) -> None:
+    """The flow that a fit would compute, in its sequence: the same for sizes that it keeps."""
+    sequence = _sequence(folder)
+    if sequence.flow.forward or sequence.flow.backward:
+        return
+    flow = compute_flow(sequence)
+    for images, name in ((flow.backward, "backward_flow_2"), (flow.forward, "forward_flow_2")):
+        (folder / name).mkdir(exist_ok=True)
+        for n, image in images.items():
+            np.save(folder / name / f"flow_{n:04d}.npy", image)
+    _sequence.cache_clear()
+
+
 def _mixed(scene: Any, setup: Setup, times: np.ndarray) -> np.ndarray:
     """True distance as the mean over a pixel's area [m]: what no sharper image than ours has."""
 
@@ -198,7 +257,7 @@ def _mixed(scene: Any, setup: Setup, times: np.ndarray) -> np.ndarray:
     return np.stack([averaged(distance, RAYS) for distance in hits])
 
 
-def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
+def _fitted(job: Job, setup: Setup, known: str | None, fits: Fits) -> Result | None:
     """Fit and score."""
     assert job.row is not None
     sequence = _sequence(job.folder(setup))
@@ -207,11 +266,7 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
     key = _hash(plain(settings), job.seed, data_hash(sequence), kind)
     if key == known:
         return None
-    folder = setup.out / "runs" / job.id(setup).replace("/", "_")
-    shutil.rmtree(folder, ignore_errors=True)
-    if kind == "cuda":
-        torch.cuda.reset_peak_memory_stats(setup.device)
-    run = reconstruct(sequence, folder, settings, seed=job.seed, device=setup.device)
+    run = fits.run(job, sequence, settings)
     scores = compare(run, report=False)
     _draw(job, setup, run, sequence, scores)
     result = {
@@ -220,13 +275,12 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
         "scores": scores,
         "seconds": run.config["seconds_reconstruct"],
         "gaussians": run.gaussians,
-        "rise": _rise(folder),
+        "rise": _rise(run.path),
+        "attempts": len(run.config.get("attempts", [1])),
         "memory_mib": torch.cuda.max_memory_allocated(setup.device) / 2**20
         if kind == "cuda"
         else None,
     }
-    if not setup.keep:
-        shutil.rmtree(folder, ignore_errors=True)
     return result
 
 
@@ -297,20 +351,26 @@ def _hash(*values: object) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """What a process does with (job, key of its known result): None if there is nothing to do."""
+    """What a process does with a task: (job, key of its known result) of jobs that share a fit."""
 
     setup: Setup
     """Of all jobs."""
 
-    def __call__(self, task: tuple[Job, str | None], place: Place) -> Result | None:
-        """Do a job; if it fails, its result is the error."""
+    def __call__(self, task: Task, place: Place) -> list[Result | None]:
+        """Do the jobs: a result each, None if there is nothing to do, the error if one fails."""
         torch.set_num_threads(max(len(place.cpus), 1))
         cv2.setNumThreads(max(len(place.cpus), 1))
         wp.config.log_level = wp.LOG_ERROR
-        job, known = task
         setup = replace(self.setup, device=place.device)
+        fits = Fits(setup)
         try:
-            return result_of(job, setup, known)
+            return [self._result(job, setup, known, fits) for job, known in task]
+        finally:
+            fits.clear()
+
+    def _result(self, job: Job, setup: Setup, known: str | None, fits: Fits) -> Result | None:
+        try:
+            return result_of(job, setup, known, fits)
         except GftorfError as error:
             why = " ".join(f"{type(error).__name__}: {error}".split())
         except Exception as error:  # a job never ends the benchmark

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gftorf_warp.recon.residuals import problems
+
 Result = dict[str, Any]
 PARTS = ("all", "moving", "static")
 MOVING_CLASSES = ("moving interior", "moving edge")
@@ -22,7 +24,7 @@ SUMMARY = (
     "row", "d / closed form", "fit alone, measured", "median", "d_ToF", "d / temporal",
     "moving interior / edge, static", "static interior, throughout", "worst scene",
     "worse than closed form", "than temporal", "seeds max / min", "rise",
-    "chi-square, unexplained", "seconds", "Gaussians", "failed",
+    "chi-square, unexplained", "repeated, warned, unnoticed", "seconds", "Gaussians", "failed",
 )  # fmt: skip
 
 
@@ -58,6 +60,16 @@ def geometric_mean(values: Iterable[float | None]) -> float | None:
 def worse(result: Result, over: str = "closed_form") -> bool:
     """Whether d is worse than another distance on all, moving or static pixels."""
     return any((ratio(result, part, over=over) or 0.0) > 1.0 for part in PARTS)
+
+
+def warned(result: Result) -> bool:
+    """Whether the fit said by itself that something is wrong."""
+    return bool(problems(result["scores"].get("explained")))
+
+
+def unnoticed(result: Result) -> bool:
+    """Whether the fit alone is worse than the closed form over all pixels, and did not say so."""
+    return (ratio(result, "all", "d_fit") or 0.0) > 1.0 and not warned(result)
 
 
 def by_scene(results: Iterable[Result]) -> dict[str, list[Result]]:
@@ -155,6 +167,8 @@ def _line(fits: list[Result]) -> list[str]:
         f"{_number(geometric_mean(known))}, {_number(max(known))}" if known else NONE,
         f"{np.median(rises):.3g}, {max(rises):.3g}" if rises else NONE,
         f"{_number(chi)}, {100 * np.mean(shares):.2g} %" if shares else NONE,
+        f"{sum(fit.get('attempts', 1) > 1 for fit in fits)}, {sum(map(warned, fits))}, "
+        f"{sum(map(unnoticed, fits))}",
         f"{np.median(seconds):.1f}, {max(seconds):.1f}" if seconds else NONE,
         f"{int(np.median([fit['gaussians'] for fit in fits]))}" if seconds else NONE,
     ]

@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +21,9 @@ import accuracy_jobs
 import accuracy_table
 
 from gftorf_warp import simulate
+from gftorf_warp.data.flow import compute_flow
+from gftorf_warp.data.read import read
+from gftorf_warp.data.sequence import Flow
 from gftorf_warp.sim.random_scene import random_scene
 from gftorf_warp.sim.world import first_hit
 from gftorf_warp.sweep import workers
@@ -51,7 +54,11 @@ def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
     interior = {"d_mse_x100": d[2], "temporal_mse_x100": 0.25}
     scores["static_throughout"] = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.5}
     scores["source"] = {"fit": 0.8} if seed == 0 else None
-    scores["explained"] = {"reduced_chi_square": 2.0, "unexplained_share": 0.01}
+    share = 0.01 if "attempts" not in more else 0.04
+    ranges = {key: [0, 7] for key in ("columns", "rows", "frames")}
+    others = dict.fromkeys(("changing_unexplained_share", "contradicted_share"))
+    shares = {"reduced_chi_square": 2.0, "unexplained_share": share}
+    scores["explained"] = shares | ranges | others
     classes = {"moving": {"edge": {"d_mse_x100": 3.0, "closed_form_mse_x100": 6.0}}}
     scores |= scores.pop("all") | {"classes": classes | {"static": {"interior": interior}}}
     return {"row": row, "scene": scene, "seed": seed, "scores": scores} | {
@@ -143,6 +150,25 @@ def test_a_limit_leaves_jobs_for_later(tmp_path, capsys):
     assert "6 jobs are left" in capsys.readouterr().out
 
 
+def test_rows_that_differ_after_the_fit_share_it(tmp_path):
+    """One fit, scored with and without outlines; flow is in the sequence, as a fit computes it."""
+    listed = tmp_path / "rows.txt"
+    listed.write_text("# a comment\nbest\n\nplain=best,outlines=false  # another\n")
+    command = ["--out", str(tmp_path), "--rows", str(listed), *TINY[:-3], "0", "--workers", "1"]
+    assert accuracy.main([*command, "--scenes", "1", "--flow"]) == 0
+    lines = map(json.loads, (tmp_path / "results.jsonl").read_text().splitlines())
+    _, best, plain = lines
+    assert (best["row"], plain["row"]) == ("best", "plain")
+    assert best["seconds"] == plain["seconds"]
+    assert best["scores"]["source"].keys() != plain["scores"]["source"].keys()
+    assert best["scores"]["d_mse_x100"] != plain["scores"]["d_mse_x100"]
+    (folder,) = (tmp_path / "scenes").iterdir()
+    sequence = read(folder)
+    computed = compute_flow(replace(sequence, flow=Flow()))
+    for n, image in computed.forward.items():
+        np.testing.assert_array_equal(image, sequence.flow.forward[n])
+
+
 def test_other_settings_or_data_are_another_key(tmp_path):
     """A result is kept only for the same settings, seed and data."""
     folder, setup = tmp_path, setup_in(tmp_path)
@@ -178,9 +204,9 @@ def test_a_process_that_dies_is_a_failed_job(tmp_path):
     """The others are done by another process."""
     jobs = [Deadly(scene="random-1"), accuracy_jobs.Job(scene="random-2")]
     with workers.Workers([PLACE], accuracy_jobs.Work(setup_in(tmp_path))) as one:
-        found = dict(one.outcomes([(job, None) for job in jobs], tries=1))
-    assert found[jobs[0], None] == workers.Lost("its process ended with exit code 9")
-    assert "error" not in found[jobs[1], None]
+        found = dict(one.outcomes([((job, None),) for job in jobs], tries=1))
+    assert found[((jobs[0], None),)] == workers.Lost("its process ended with exit code 9")
+    assert "error" not in found[((jobs[1], None),)][0]
 
 
 def test_a_job_that_never_ends_is_left_after_the_limit(tmp_path, monkeypatch):
@@ -188,7 +214,7 @@ def test_a_job_that_never_ends_is_left_after_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "GRACE_S", 0.1)
     with workers.Workers([PLACE], accuracy_jobs.Work(setup_in(tmp_path))) as one:
         limit = time.monotonic() + 0.1
-        assert list(one.outcomes([(Endless(scene="random-1"), None)], deadline=limit)) == []
+        assert list(one.outcomes([((Endless(scene="random-1"), None),)], deadline=limit)) == []
 
 
 def test_rows_and_numbers_of_the_command_line(capsys):
@@ -212,7 +238,7 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     """Geometric means, the worst scene, scenes and fits worse in any part, spread, failures."""
     results = [
         result("a", "one", 0, (0.1, 0.2, 0.5)),
-        result("a", "one", 1, (0.4, 0.2, 1.5)),
+        result("a", "one", 1, (0.4, 0.2, 1.5), attempts=2),
         result("a", "two", 0, (0.8, 0.4, 0.9)),
         result("a", "two", 1, (0.8, 0.4, 0.9)),
         {"row": "a", "scene": "two", "seed": 2, "id": "a/two/2", "error": "no memory"},
@@ -228,7 +254,8 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     assert line[2] == "0.8 / 0.566 / 1.77, 10 %"
     assert line[5:8] == ["0.8 / 0.566 / 1.77", "- / 0.5, - / -", "3.53, 1.77"]
     assert line[8:10] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
-    assert line[10:14] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "1.5, 2", "2, 1 %"]
+    assert line[10:14] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "1.5, 2", "2, 1.8 %"]
+    assert line[14] == "1, 1, 2"
     assert line[-1] == "1 |"
     assert lines[4].count("-") >= 9
     assert accuracy_table.worst_first(results[:4])[0]["id"] == "a/one/1"

@@ -100,17 +100,19 @@ def test_a_turn_that_the_fit_knows_is_kept(box):
 
 
 def test_where_the_fit_fails_the_quartet_itself_is_taken(box):
-    """A black fit: where the box has just arrived and is seen by all four frames, the closed form;
-    what moves within the quartet fits no phasor and keeps the fit.
+    """A dark fit: where the box has just arrived and is seen by all four frames, the closed form;
+    what moves within the quartet fits no phasor and keeps the fit, unless that is black.
     """
     measured, quads, truth = box
-    found = fallback_of(measured, np.zeros_like(quads))
+    found = fallback_of(measured, 0.2 * quads)
     distance, source, _ = applied(found, np.full((36, 48), 9.0), 13)
     inside = np.logical_and.reduce([seen(n)[2] for n in range(12, 16)])
     moved = (source == CLOSED_FORM) & inside
     assert moved.sum() > 0.3 * inside.sum()
     assert np.median(np.abs(distance - truth[13])[moved]) < 0.1
     assert (source == FIT).any()
+    black = fallback_of(measured, np.zeros_like(quads))
+    assert not (applied(black, np.full((36, 48), 9.0), 13)[1] == FIT).any()
     assert SOURCES[CLOSED_FORM] == "closed_form"
 
 
@@ -141,7 +143,7 @@ def test_nothing_is_averaged_where_the_camera_moves(box):
     measured, quads, truth = box
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 0, 3] = 1e-4 * np.arange(FRAMES)
-    found = fallback_of(replace(measured, camera_from_world=poses), np.zeros_like(quads))
+    found = fallback_of(replace(measured, camera_from_world=poses), 0.2 * quads)
     camera = found.camera.at(poses[13])
     given = found.applied(rendering(truth[13] + 1.0), 13 / FRAME_RATE_HZ, camera)
     assert set(given.source.unique().tolist()) == {FIT, CLOSED_FORM}

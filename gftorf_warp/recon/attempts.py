@@ -18,8 +18,8 @@ from typing import Any
 from ..data.files import atomic_write
 from ..scene.initialise import Init
 from ..scene.motion import MotionSettings, Nodes
-from . import checkpoint
-from .residuals import Residuals, failures
+from . import checkpoint, folder
+from .residuals import Residuals, failures, warn
 from .settings import ReconSettings
 from .state import State, from_dict, to_dict
 
@@ -98,7 +98,29 @@ def run(
         checkpoint.save(out, to_dict(state))
 
 
-def as_json(judged: list[Judged], kept: int) -> list[Judged]:
+def are_over(stored: dict | None, settings: ReconSettings, out: Path) -> bool:
+    """Whether nothing is left to train: all images are used up, and no other attempt may follow."""
+    if stored is None or stored["images"] < settings.schedule.images:
+        return False
+    return settings.attempts_max == 1 or "explained" in folder.read_config(out)
+
+
+def conclude(
+    out: Path,
+    config: dict[str, Any],
+    state: Mapping[str, Any],
+    found: Residuals | None,
+) -> None:
+    """Write what config.json says of a finished run, by its state and residuals at the end."""
+    config |= {"seconds_reconstruct": state["seconds"], "images_optimised": state["images"]}
+    config |= {name: state[name] for name in ("skipped", "restarts", "revivals") if name in state}
+    if state.get("judged"):
+        config["attempts"] = _as_json(state["judged"], state["attempt"])
+    warn(found)
+    folder.write_config(out, config | {"explained": found and found.as_json()})
+
+
+def _as_json(judged: list[Judged], kept: int) -> list[Judged]:
     """All attempts of a run for config.json; none if there was one alone."""
     return [{**one, "kept": one["attempt"] == kept} for one in judged]
 

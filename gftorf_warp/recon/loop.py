@@ -149,7 +149,7 @@ class TrainingLoop:
         """Write one row of metrics: means over the images since the last one."""
         row = row_of_sums(state, self.peak, self.clock())
         if row is not None:
-            self.metrics.add(row | ({} if state.attempt == 1 else {"attempt": state.attempt}))
+            self.metrics.add(row)
             if self.progress is not None:
                 shown = {name: row[key] for name, key in SHOWN.items()}
                 self.progress(state.images, self.settings.schedule.images, **shown)
@@ -159,8 +159,9 @@ class TrainingLoop:
         number = state.restarts + 1
         seed = self.seed + SEED_STEP * number
         fresh = begin(self.observations, self.settings, seed=seed, device=self.device)
-        fresh.restarts, fresh.skipped, fresh.rollbacks = number, state.skipped, state.rollbacks
-        fresh.attempt, fresh.judged, fresh.other = state.attempt, state.judged, state.other
+        fresh.restarts = number
+        for name in ("skipped", "rollbacks", "attempt", "judged", "other"):
+            setattr(fresh, name, getattr(state, name))
         for rows in (self.metrics, self.diagnostics):
             rows.rewind(-1)
         self.save(fresh)
@@ -219,6 +220,7 @@ def row_of_sums(state: State, peak: float, seconds: float) -> Row | None:
     means = {name: value / count for name, value in sums.items()}
     mse = means.pop("quad_mse")
     row: Row = {"images": state.images, "seconds": seconds, "loss": means.pop("loss"), **means}
+    row |= {} if state.attempt == 1 else {"attempt": state.attempt}
     psnr = 10.0 * math.log10(peak**2 / mse) if mse > 0 else None
     return row | {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
 

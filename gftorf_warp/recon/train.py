@@ -5,10 +5,10 @@ from __future__ import annotations
 import enum
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
@@ -270,12 +270,12 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         LOG.info("%s is finished: a closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
-    if _is_finished(stored, settings, out):
+    if attempts.are_over(stored, settings, out):
         if sequence.path is not None:  # it may have moved
             source.remember(out, sequence.path)
         known = folder.read_config(out)
         if "explained" not in known:  # the process was killed after the last checkpoint
-            _conclude(out, known, stored, _judged(sequence, out, device))
+            attempts.conclude(out, known, stored, _judged(sequence, out, device))
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     if settings.method.is_volume:
@@ -307,7 +307,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         folder.write_config(out, config)
         state, found = _fit_gaussians(sequence, *given, **more)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
-    _conclude(out, config, vars(state), found)
+    attempts.conclude(out, config, vars(state), found)
 
 
 def _judged(
@@ -315,28 +315,6 @@ def _judged(
 ) -> residuals.Residuals | None:
     """Residuals of what is stored in the folder of a run."""
     return residuals.residuals(Run.open(out, device), sequence)
-
-
-def _conclude(
-    out: Path,
-    config: dict[str, Any],
-    state: Mapping[str, Any],
-    found: residuals.Residuals | None,
-) -> None:
-    """Write what config.json says of a finished run, by its state and residuals at the end."""
-    config |= {"seconds_reconstruct": state["seconds"], "images_optimised": state["images"]}
-    config |= {name: state[name] for name in ("skipped", "restarts", "revivals") if name in state}
-    if state.get("judged"):
-        config["attempts"] = attempts.as_json(state["judged"], state["attempt"])
-    residuals.warn(found)
-    folder.write_config(out, config | {"explained": found and found.as_json()})
-
-
-def _is_finished(stored: dict | None, settings: ReconSettings, out: Path) -> bool:
-    """Whether nothing is left to train: all images are used up, and no other attempt may follow."""
-    if stored is None or stored["images"] < settings.schedule.images:
-        return False
-    return settings.attempts_max == 1 or "explained" in folder.read_config(out)
 
 
 def _fit_gaussians(
