@@ -98,9 +98,9 @@ def run(
         checkpoint.save(out, to_dict(state))
 
 
-def are_over(stored: dict | None, settings: ReconSettings, out: Path) -> bool:
+def are_over(stored: dict[str, Any], settings: ReconSettings, out: Path) -> bool:
     """Whether nothing is left to train: all images are used up, and no other attempt may follow."""
-    if stored is None or stored["images"] < settings.schedule.images:
+    if stored["images"] < settings.schedule.images:
         return False
     return settings.attempts_max == 1 or "explained" in folder.read_config(out)
 

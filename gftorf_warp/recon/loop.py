@@ -159,9 +159,7 @@ class TrainingLoop:
         number = state.restarts + 1
         seed = self.seed + SEED_STEP * number
         fresh = begin(self.observations, self.settings, seed=seed, device=self.device)
-        fresh.restarts = number
-        for name in ("skipped", "rollbacks", "attempt", "judged", "other"):
-            setattr(fresh, name, getattr(state, name))
+        _begin_again(fresh, state)
         for rows in (self.metrics, self.diagnostics):
             rows.rewind(-1)
         self.save(fresh)
@@ -206,6 +204,13 @@ def restarts(
         "after %d images the loss is still that of black images: the run %s", state.images, then
     )
     return again
+
+
+def _begin_again(fresh: State, state: State) -> None:
+    """Give a start what stays of the state that it replaces."""
+    fresh.restarts = state.restarts + 1
+    for name in ("skipped", "rollbacks", "attempt", "judged", "other"):
+        setattr(fresh, name, getattr(state, name))
 
 
 def row_of_sums(state: State, peak: float, seconds: float) -> Row | None:

@@ -270,7 +270,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         LOG.info("%s is finished: a closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
-    if attempts.are_over(stored, settings, out):
+    if stored is not None and attempts.are_over(stored, settings, out):
         if sequence.path is not None:  # it may have moved
             source.remember(out, sequence.path)
         known = folder.read_config(out)
