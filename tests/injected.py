@@ -25,13 +25,6 @@ def far_off(state):
         tensors["reflectivity_sh"] *= 1.5**2
 
 
-def dead(state):
-    """A motion network none of whose units lets anything through."""
-    with torch.no_grad():
-        state.motion.layers[1].bias.fill_(-1e3)
-        state.motion.layers[-1].bias.fill_(-1e3)
-
-
 def nan_flow(sequence):
     """Optical flow that is unknown everywhere."""
     return _flow(sequence, lambda flow: np.full_like(flow, np.nan))
