@@ -344,6 +344,20 @@ def _sweep(options: argparse.Namespace) -> int:
     return exit_code(results.values())
 
 
+def _reproduce(options: argparse.Namespace) -> int:
+    from .sweep import reproduce
+
+    if options.list or options.name is None:
+        print(reproduce.listed(reproduce.stated_results()))
+        return 0
+    stated = reproduce.stated_result(options.name)
+    options.device = stated.device if options.device == "auto" else options.device
+    given = {**_named(options, "out", "seeds"), "progress": _progress(options)("reproduce")}
+    found = reproduce.reproduce(stated, device=start(options), **given)
+    print((reproduce.as_json if options.json else reproduce.table)(stated, found))
+    return 0 if all(one.within for one in found) else 1
+
+
 def _gpus() -> list[str]:
     """All GPUs of this machine."""
     import torch
@@ -430,6 +444,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
         _compare,
         _view,
         _sweep,
+        _reproduce,
         _doctor,
         _bench,
     )

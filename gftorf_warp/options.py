@@ -300,6 +300,20 @@ def command_parsers() -> dict[str, Parser]:
     sweep.option("--scheduler", "ADDRESS", str, addresses)
     sweep.flag("--dry-run", "list the jobs and do nothing")
 
+    reproduce = Parser.of(
+        "reproduce", "do a stated result again: exit code 1 if it is outside the stated spread"
+    )
+    reproduce.add_argument("name", metavar="NAME", nargs="?", help="its name, see --list")
+    reproduce.flag("--list", "list the stated results")
+    out = "new folder for its runs (gftorf-reproduce-NAME)"
+    reproduce.option("--out", "DIR", str, out)
+    seeds = "seeds of the optimiser (those of the result)"
+    reproduce.option("--seeds", "N,N", _list_of(_whole), seeds)
+    reproduce.flag("--json", "print JSON in place of a table")
+    where = "auto (default): where it was measured, or cpu, or cuda; cuda:1 is the second GPU"
+    reproduce.option("--device", "auto|cpu|cuda", _device, where, "auto")
+    reproduce.option("--threads", "N", _positive, THREADS)
+
     doctor = Parser.of(
         "doctor", "print versions and devices, and test the renderer on this machine"
     )
@@ -334,6 +348,7 @@ def command_parsers() -> dict[str, Parser]:
         compare,
         view,
         sweep,
+        reproduce,
         doctor,
         bench,
     )

@@ -1,0 +1,117 @@
+"""Fuzz the readers of foreign files under coverage, by libFuzzer: inputs that reach new lines are
+kept and changed further. The random form, which needs no package, is benchmarks/fuzz.py.
+
+    pip install atheris
+    python benchmarks/fuzz_coverage.py [--seconds S] [--only READER ..] [--corpus DIR]
+
+An input is a number, which file of the reader's folder it replaces, and the bytes of that file; the
+first ones are the whole files of tests/damaged_files.py. An error of errors.py is what damage
+should end in. Anything else ends the process of its reader and is a finding, whose input is in
+DIR/READER/found-*, as is one that takes ten seconds or 4 GB; hash-protected files are left to
+fuzz.py. Inputs stay in DIR/READER/, so that the next call goes on from them. Prints a row per
+reader; the exit code is 1 if there is a finding.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+READ_BY = ("data", "importers", "sim.mesh_file", "sim.scene_file", "recon.checkpoint")
+LIMITS = ("-timeout=10", "-rss_limit_mb=4096", "-max_len=262144", "-reload=0")
+ENDED = re.compile(r"cov: (\d+) .*corp: (\d+)/")
+RUNS = re.compile(r"stat::number_of_executed_units: (\d+)")
+
+
+def fuzz(name: str, corpus: Path, seconds: int) -> None:
+    """Fuzz one reader until the time is over or something is found; ends the process."""
+    import atheris
+
+    included = [f"gftorf_warp.{part}" for part in READ_BY]
+    with atheris.instrument_imports(include=included):
+        from damaged_files import READERS, whole
+
+        from gftorf_warp.errors import GftorfError
+
+    logging.disable()
+    reader, place = READERS[name], Path(tempfile.mkdtemp()) / "files"
+    shutil.copytree(whole(name), place)
+    files = [path for path in sorted(place.glob(reader.damaged)) if path.is_file()]
+    contents = [path.read_bytes() for path in files]
+    for number, content in enumerate(contents):
+        (corpus / f"whole-{number}").write_bytes(bytes([number]) + content)
+
+    def attempt(data: bytes) -> None:
+        if not data:
+            return
+        number = data[0] % len(files)
+        files[number].write_bytes(data[1:])
+        try:
+            reader.read(place)
+        except GftorfError:
+            pass  # what damage should end in
+        finally:
+            files[number].write_bytes(contents[number])
+
+    words = [sys.argv[0], str(corpus), *LIMITS, f"-max_total_time={seconds}"]
+    words += [f"-artifact_prefix={corpus.parent}/found-", "-print_final_stats=1"]
+    atheris.Setup(words, attempt)
+    atheris.Fuzz()
+
+
+def row(name: str, place: Path, seconds: int) -> tuple[list[str], bool]:
+    """Cells of a reader after its time, and whether it ended otherwise than by its time."""
+    corpus = place / name / "inputs"
+    corpus.mkdir(parents=True, exist_ok=True)
+    words = [sys.executable, __file__, "--one", name, "--corpus", str(corpus)]
+    with tempfile.TemporaryDirectory() as temporary:
+        done = subprocess.run(
+            [*words, "--seconds", str(seconds)],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            env=os.environ | {"TMPDIR": temporary},
+            check=False,
+        )
+    (place / name / "log.txt").write_text(done.stdout + done.stderr)
+    covered, runs = ENDED.findall(done.stderr), RUNS.findall(done.stderr)
+    lines, inputs = covered[-1] if covered else ("-", "-")
+    found = done.returncode != 0
+    tried, verdict = runs[-1] if runs else "-", "see log.txt" if found else "none"
+    return [name, tried, lines, inputs, verdict], found
+
+
+def main() -> int:
+    """Readers one after the other; 1 if anything was found."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("--seconds", type=int, default=60, help="for each reader")
+    parser.add_argument("--only", nargs="+", help="readers, as in tests/damaged_files.py")
+    parser.add_argument("--corpus", type=Path, default=Path("fuzz-corpus"), help="inputs and logs")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        fuzz(options.one, options.corpus, options.seconds)
+    from damaged_files import READERS
+
+    names = [name for name, reader in READERS.items() if not reader.protected]
+    names = [name for name in names if "run" not in name and "checkpoint" not in name]
+    print("| files | inputs tried | edges reached | inputs kept | found |\n|---|---|---|---|---|")
+    failed = False
+    for name in options.only or names:
+        cells, found = row(name, options.corpus.resolve(), options.seconds)
+        failed |= found
+        print("|", " | ".join(cells), "|", flush=True)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
