@@ -17,7 +17,7 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.read import read, read_without_images
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.evaluate.views import views_to_take
+from gftorf_warp.evaluate.views import RENDERED, gather, views_to_take
 from gftorf_warp.export.command import export
 from gftorf_warp.recon.joined import Joined, Window, blended, folder_of
 from gftorf_warp.recon.train import reconstruct
@@ -174,6 +174,29 @@ def test_images_are_continuous_across_a_seam(run):
     quads = torch.stack([run.render(float(time), camera).quads for time in times])
     steps = quads.diff(dim=0).abs().amax(dim=(1, 2, 3))
     assert steps.max() < 0.25 * (quads[-1] - quads[0]).abs().max()
+
+
+def test_images_of_an_overlap_are_those_that_are_scored(run):
+    """Fits are blended, then corrected: by render, by renderer, and in compare, which needs the fit
+    as well.
+    """
+    corrections = {"fallback": True, "outlines": True}
+
+    def with_corrections(one):
+        return replace(one, config=one.config | {"settings": one.config["settings"] | corrections})
+
+    joined = run.joined.mapped(with_corrections)
+    corrected = replace(with_corrections(run), joined=joined)
+    scored = gather(corrected, run.sequence(), [12])
+    time = float(run.sequence().times[12])
+    assert 0.2 < run.joined.share(time)[1] < 0.8
+    assert np.abs(scored.d - scored.d_fit).max() > 0.1
+    for shown in (
+        corrected.render(time, run.camera),
+        corrected.renderer(RENDERED)(time, run.camera),
+    ):
+        away = np.abs(shown.distance.numpy() - scored.d[0])
+        assert (away > 1e-3).mean() < 0.002  # rounding may move a pixel from surface to surface
 
 
 def test_commands_take_it_for_a_run(run, capsys, tmp_path):

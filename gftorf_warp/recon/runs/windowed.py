@@ -20,6 +20,7 @@ from .. import source
 from ..joined import Joined, Window, folder_of, refused
 from ..read_back import ReadBack
 from ..settings import Method
+from . import gaussians
 from .base import Run
 from .empty import WithoutGaussians, with_empty_extra
 
@@ -28,7 +29,9 @@ from .empty import WithoutGaussians, with_empty_extra
 class WindowedRun(WithoutGaussians):
     """A run of a long recording, whose windows are runs of their own, see joined.py.
 
-    Times are those of the recording. Two windows are in memory at a time.
+    Times are those of the recording. Two windows are in memory at a time. Where they overlap, their
+    fits are blended, and what is shown is the blended image after the settings ``fallback`` and
+    ``outlines``.
     """
 
     joined: Joined[Run]
@@ -57,6 +60,7 @@ class WindowedRun(WithoutGaussians):
         """Whether colour can be rendered."""
         return self.config.get("colour_scale") is not None
 
+    @torch.no_grad()
     def render(
         self,
         time: float,
@@ -69,9 +73,13 @@ class WindowedRun(WithoutGaussians):
         fits = Method(self.config["settings"].get("method", Method.GAUSSIANS)).fits
         if fits:
             camera = camera or self.camera
-        rendering = self.joined.rendered(
-            time, lambda window, local: window.render(local, camera, f_mod_hz=f_mod_hz)
-        )
+
+        def fitted(window: Run, local: float) -> Rendering:
+            if isinstance(window, WithoutGaussians):
+                return window.render(local, camera, f_mod_hz=f_mod_hz)
+            return gaussians.rendering_of(window, local, camera, extra=None, f_mod_hz=f_mod_hz)
+
+        rendering = self.corrected(self.joined.rendered(time, fitted), time, camera, f_mod_hz)
         return with_empty_extra(rendering, extra)
 
     def renderer(
@@ -82,13 +90,20 @@ class WindowedRun(WithoutGaussians):
         corrected: bool = True,
     ) -> Callable[[float, Camera], Rendering]:
         """As :meth:`Run.renderer`."""
-        names = tuple(images)
+        names = frozenset(images)
+        settings = self.config["settings"]
+        corrects = settings.get("outlines") or settings.get("fallback")
+        corrects = corrects and corrected and "distance" in names
+        needed = names | {"phasor"} if corrects else names
         renderers: Joined[Callable[[float, Camera], Rendering]] = self.joined.mapped(
-            lambda window: window.renderer(names, f_mod_hz=f_mod_hz, corrected=corrected)
+            lambda window: window.renderer(needed, f_mod_hz=f_mod_hz, corrected=False)
         )
-        return lambda time, camera: renderers.rendered(
-            time, lambda render, local: render(local, camera)
-        )
+
+        def shown(time: float, camera: Camera) -> Rendering:
+            fit = renderers.rendered(time, lambda render, local: render(local, camera))
+            return self.corrected(fit, time, camera, f_mod_hz) if corrects else fit
+
+        return shown
 
     def corrected(
         self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
