@@ -16,6 +16,7 @@ import pytest
 
 from gftorf_warp import __version__, cli, options
 from gftorf_warp.errors import BusyError, DivergedError, InputError, ResourceError, UsageError
+from gftorf_warp.evaluate.printed import table
 
 SIZE, FRAMES = "32x24", "8"
 HEAVY = ("torch", "warp", "numpy", "matplotlib", "cv2", "scipy")
@@ -512,7 +513,7 @@ def test_table_without_truth():
         "moving": nothing,
         "static": nothing,
     }
-    lines = cli.table(metrics).splitlines()
+    lines = table(metrics).splitlines()
     assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 6] * 3
     assert "20.00 dB" in lines[-1]
 
