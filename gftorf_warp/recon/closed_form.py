@@ -25,6 +25,7 @@ from ..scene.camera import Camera
 from ..scene.sensor import channel_of, quad_from_phasor
 
 POSE_TOLERANCE = 1e-6  # [m], [1] poses are stored as float32 at worst
+TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
 
 
 def rendering_of(
@@ -57,6 +58,19 @@ def rendering_of(
         extra=None if extra_channels is None else tensor(np.zeros((extra_channels, *size))),
         screen=None,
     )
+
+
+def row_of(sequence: Sequence, time: float, camera: Camera, own: Camera) -> int | None:
+    """Which complete quartet, counted from 0, a time [s] is in, seen from the sequence's own
+    camera; None outside of them, and for another camera.
+    """
+    quartet = nearest_quartet(sequence, time)
+    times = sequence.times[sequence.quartet_frames(quartet)]
+    if not times[0] - TIME_S <= time <= times[-1] + TIME_S:
+        return None
+    if another_view(sequence, time, camera, own):
+        return None
+    return sequence.complete_quartets.index(quartet)
 
 
 def another_view(sequence: Sequence, time: float, camera: Camera, own: Camera) -> str:

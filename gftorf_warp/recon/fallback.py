@@ -46,7 +46,6 @@ from .residuals import Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
-TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,7 +136,10 @@ class Fallback:
         ``source`` is 0 where the fit stays, everywhere if the time [s] is in no complete quartet or
         the camera is another. Nothing is transparent where the distance was replaced.
         """
-        row, fit = self._row(time, camera), rendering.distance
+        row, fit = (
+            closed_form.row_of(self.sequence, time, camera, self.camera),
+            rendering.distance,
+        )
         if row is None:
             return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)
@@ -153,16 +155,6 @@ class Fallback:
         if opacity.numel():
             opacity = torch.where(source > 0, torch.ones_like(opacity), opacity)
         return replace(rendering, distance=distance, opacity=opacity, source=source)
-
-    def _row(self, time: float, camera: Camera) -> int | None:
-        """The complete quartet of a time, seen from the sequence's own camera."""
-        quartet = closed_form.nearest_quartet(self.sequence, time)
-        times = self.sequence.times[self.sequence.quartet_frames(quartet)]
-        if not times[0] - TIME_S <= time <= times[-1] + TIME_S:
-            return None
-        if closed_form.another_view(self.sequence, time, camera, self.camera):
-            return None
-        return self.sequence.complete_quartets.index(quartet)
 
 
 def _odds(wrong: float | None, found: Residuals) -> float:

@@ -7,12 +7,14 @@ phases psi of both and the share s of the pixel's area that the first one covers
 
     P = s a_1 exp(i psi_1) + (1 - s) a_2 exp(i psi_2)
 
-The ray through the centre meets the first one if s > 1/2, for a straight outline. The amplitude of
-the surface behind is that of its neighbour; the one in front may be turning away at its outline, so
-that its amplitude is extrapolated from two. Both are known to some 30 %, so every share has a
-likelihood, and the distance is the mean of both surfaces' distances, weighted by the odds that the
-centre is on them. Pairs of neighbours in four directions vote with their likelihoods, against a
-surface of the pixel's own, of which any phasor is as likely: its distance is the rendered one.
+The ray through the centre meets the first one if s > 1/2, for a straight outline. The surface
+behind goes on behind the other one: its amplitude is that of its neighbour, within some 20 %. The
+one in front may turn away at its outline, or show a narrow side there: its amplitude is
+extrapolated from two neighbours, and known half as well. So every share has a likelihood, and the
+distance is the mean of both surfaces' distances, weighted by the odds that the centre is on them.
+Pairs of neighbours in four directions vote with their likelihoods, against a surface of the pixel's
+own, of which any phasor is as likely: its distance is the rendered one. The phasor is not only
+rendered, see phasors.py.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from torch import Tensor
 from ..data.steps import STEP_M
 from ..render.api import Rendering
 from ..scene.sensor import Sensor
+from .phasors import Phasor, rendered_phasor
 
 OUTLINE = 3  # in a map of sources, see fallback.py
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns)
@@ -35,30 +38,31 @@ PASSES = 2  # the second one sees neighbours that are no mixtures any more
 SHARES = 21  # of the area of a pixel, from 0 to 1
 BLUR = 0.08  # [pixels] outlines are not straight: how sure the share makes of the centre
 SMOOTH = 0.25  # [steps] distances of two neighbours on one side differ by less
-AMPLITUDE_SPREAD = 0.3  # [1] standard deviation of an extrapolated amplitude, relative
-EXTRAPOLATION = 0.7  # [1] at most, of the logarithm of the amplitude
-MODEL_ERROR = 0.01  # [amplitudes] of a rendered phasor, of the largest amplitude nearby
+FRONT_SPREAD = 0.4  # [1] standard deviation of an extrapolated amplitude, relative: a side face
+BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
+EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
 LEAST = 1e-12  # [quad units] below it a neighbour is black
-MARGIN = 2  # [pixels] to the farthest neighbour
+MARGIN = 3  # [pixels] to the farthest neighbour
 
 
-def resolved(rendering: Rendering, sensor: Sensor) -> Rendering:
+def resolved(rendering: Rendering, sensor: Sensor, phasor: Phasor | None = None) -> Rendering:
     """A rendering with the distances of its mixed pixels resolved.
 
     Args:
         rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
+        phasor: The phasor as well as it is known; None: as it is rendered.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
     """
-    re, im = rendering.phasor[:2]
+    phasor = phasor or rendered_phasor(rendering)
     fit = distance = rendering.distance
     source = rendering.source
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
-    rendered = (source == 0) & (rendering.phasor[2] > 0.0)  # the others are measured, or black
+    where = (source == 0) & (rendering.phasor[2] > 0.0)  # the others are measured, or black
     for _ in range(PASSES):
-        distance = _resolved(distance, torch.complex(re, im), rendered, sensor)
+        distance = _resolved(distance, phasor, where, sensor)
     changed = (distance - fit).abs() > 0.01 * STEP_M
     return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
 
@@ -70,13 +74,15 @@ class _Side(NamedTuple):
     """Of the surface there [m]."""
     amplitude: Float[Tensor, "P"]
     """Of the phasor if the surface filled the pixel."""
+    spread: Float[Tensor, "P"]
+    """Standard deviation of that amplitude over it [1]."""
 
 
 def _resolved(
-    distance: Float[Tensor, "H W"], phasor: Tensor, where: Bool[Tensor, "H W"], sensor: Sensor
+    distance: Float[Tensor, "H W"], phasor: Phasor, where: Bool[Tensor, "H W"], sensor: Sensor
 ) -> Float[Tensor, "H W"]:
     """One pass over the pixels ``where`` a distance may change."""
-    amplitude = phasor.abs().clamp_min(LEAST)
+    amplitude = phasor.value.abs().clamp_min(LEAST)
     nearby = torch.nn.functional.max_pool2d(amplitude[None], 3, stride=1, padding=1)[0]
     total = torch.full_like(distance, 1.0 / math.pi)  # density of any phasor in a unit disc
     weighted = total * distance
@@ -87,7 +93,7 @@ def _resolved(
         mixed = where & _between_two_surfaces(beyond, before, after)
         pixels = torch.nonzero(mixed, as_tuple=True)
         first, second = _sides(beyond, light, pixels, (before, after))
-        likelihood = _likelihood(phasor[pixels], nearby[pixels], first, second, sensor) / SHARES
+        likelihood = _likelihood(phasor, pixels, nearby[pixels], (first, second), sensor) / SHARES
         odds = (likelihood * on_first[:, None]).sum(dim=0)
         both = likelihood.sum(dim=0)
         mean = odds * first.distance + (both - odds) * second.distance
@@ -138,30 +144,53 @@ def _sides(
     amplitudes.
     """
     first, second = (_neighbour(distance, direction)[pixels] for direction in towards)
-    amplitudes = []
+    amplitudes, spreads = [], []
     for direction, in_front in zip(towards, (first < second, second < first), strict=True):
         once, twice = (_neighbour(light, direction, steps)[pixels] for steps in (1, 2))
         beyond = (once - twice).clamp(-EXTRAPOLATION, EXTRAPOLATION)
         amplitudes.append(torch.exp(torch.where(in_front, once + beyond, once)))
-    return _Side(first, amplitudes[0]), _Side(second, amplitudes[1])
+        spreads.append(torch.full_like(once, BACK_SPREAD).masked_fill(in_front, FRONT_SPREAD))
+    first, second = (_brought_near(distance, pixels, direction) for direction in towards)
+    return _Side(first, amplitudes[0], spreads[0]), _Side(second, amplitudes[1], spreads[1])
+
+
+def _brought_near(
+    distance: Float[Tensor, "h w"],
+    pixels: tuple[Int[Tensor, "P"], ...],
+    towards: tuple[int, int],
+) -> Float[Tensor, "P"]:
+    """The distance of a surface at some pixels: their own, if it is between the neighbour's and its
+    continuation along the slope there; else the nearer one of both.
+    """
+    own = _neighbour(distance, (0, 0))[pixels]
+    once, thrice = (_neighbour(distance, towards, steps)[pixels] for steps in (1, 3))
+    slope = 0.5 * (once - thrice)
+    low, high = slope.clamp_max(0.0), slope.clamp_min(0.0)
+    return once + torch.minimum(torch.maximum(own - once, low), high)
 
 
 def _likelihood(
-    phasor: Tensor, unit: Float[Tensor, "P"], first: _Side, second: _Side, sensor: Sensor
+    phasor: Phasor,
+    pixels: tuple[Int[Tensor, "P"], ...],
+    unit: Float[Tensor, "P"],
+    sides: tuple[_Side, _Side],
+    sensor: Sensor,
 ) -> Float[Tensor, "s P"]:
-    """Density of measuring a phasor [P] over ``unit`` if the first surface covers each share.
+    """Density of the phasors of some pixels over ``unit`` if the first surface covers each share.
 
-    The density is normal: both amplitudes are uncertain along their phases, and a model error in
-    any direction.
+    The density is normal: both amplitudes are uncertain along their phases, and the phasor is.
     """
-    shares = _shares(phasor.device)[:, None]
-    apart, covariance = -phasor / unit, torch.zeros_like(unit)
-    variance_re = variance_im = torch.full_like(unit, MODEL_ERROR**2)
-    for share, side in ((shares, first), (1.0 - shares, second)):
+    shares = _shares(unit.device)[:, None]
+    apart = -phasor.value[pixels] / unit
+    variance_re, variance_im, covariance = (
+        image[pixels] / unit.square()
+        for image in (phasor.variance_re, phasor.variance_im, phasor.covariance)
+    )
+    for share, side in zip((shares, 1.0 - shares), sides, strict=True):
         phase = sensor.phase_slope * side.distance + sensor.phase_offset
         direction = torch.polar(torch.ones_like(phase), phase)
         length = share * side.amplitude / unit
-        spread = (AMPLITUDE_SPREAD * length).square()
+        spread = (side.spread * length).square()
         apart = apart + length * direction
         variance_re = variance_re + spread * direction.real.square()
         variance_im = variance_im + spread * direction.imag.square()

@@ -22,6 +22,7 @@ from ...scene.camera import Camera
 from ...scene.gaussians import GaussianField
 from .. import checkpoint, edits, outlines
 from ..fallback import Fallback
+from ..phasors import MeasuredPhasors
 from ..read_back import ReadBack, read_back
 from ..residuals import Residuals, residuals
 from ..settings import Method
@@ -134,7 +135,11 @@ class Run(StoredRun):
         if self.fallback is not None:
             rendering = self.fallback.applied(rendering, time, camera)
         if self.config["settings"].get("outlines"):
-            rendering = outlines.resolved(rendering, at_frequency(self.sensor, f_mod_hz))
+            sensor, measured = at_frequency(self.sensor, f_mod_hz), self.measured_phasors
+            phasor = None
+            if measured is not None:
+                phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
+            rendering = outlines.resolved(rendering, sensor, phasor)
         return rendering
 
     def renderer(
@@ -186,6 +191,17 @@ class Run(StoredRun):
             return Fallback.of(self.explained, sequence, self.camera, self.field.device)
         except InputError as error:
             LOG.warning("no fallback to the measurement: %s: %s", error.what, error.why)
+            return None
+
+    @functools.cached_property
+    def measured_phasors(self) -> MeasuredPhasors | None:
+        """What was measured of mixed pixels; None for a sequence that cannot be read again, which
+        is logged.
+        """
+        try:
+            return MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
+        except InputError as error:
+            LOG.warning("outlines from renderings alone: %s: %s", error.what, error.why)
             return None
 
     def images(
