@@ -378,6 +378,14 @@ def _check(options: argparse.Namespace) -> int:
     from .data.check import check
 
     print(check(options.sequence, options.sheet))
+    if options.preset is not None:
+        from .data.read import read
+        from .recon.suitable import about_preset
+        from .recon.train import chosen_settings
+
+        sequence = read(options.sequence)
+        given = options.preset, None, "auto", None, None, ()
+        print(about_preset(sequence, chosen_settings(sequence, *given)))
     return 0
 
 

@@ -274,6 +274,7 @@ def command_parsers() -> dict[str, Parser]:
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
     text = "picture to write: the middle quartet, and distances for every order of the shifts"
     check.option("--sheet", "FILE.png", str, text)
+    check.option("--preset", "NAME", str, "whether it fits, what of it is not as published")
 
     importer = Parser.of("import", "write the recording of another camera or program as a capture")
     kind = "kind of recording, --list shows them"

@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,11 +17,13 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.lock import locked
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, ResourceError
+from gftorf_warp.evaluate import pictures
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
 from gftorf_warp.sweep.command import sweep
 from gftorf_warp.sweep.job import Task, do
 from gftorf_warp.sweep.plan import Plan, Row, Scene, read_plan
+from gftorf_warp.sweep.sheet import sheet
 from gftorf_warp.sweep.workers import Lost, Place, Workers, places
 
 TINY = """
@@ -124,8 +127,46 @@ def test_the_table_has_means_spreads_and_what_others_published(swept):
     ratio = np.exp(np.mean(np.log(np.divide(means, closed))))
     assert float(rows["over the closed form", "demo"][0]) == pytest.approx(ratio, rel=6e-3)
     page = (folder / "out" / "sweep.html").read_text()
-    assert page.count("<img class") == 2 * (2 + 2 + 1 + 2)  # truth, closed form, rows; errors
+    assert page.count("<img class") == 2, "a picture of each scene"
     assert "others (other data)" in page
+    assert "Not as published" not in page, "nobody published these rows"
+
+
+def test_a_picture_of_a_scene_has_all_rows_in_one_scale(swept):
+    """Distances of truth, closed form and rows, errors below; a file, as on the page."""
+    folder, _ = swept
+    plan = read_plan(folder / "plan.toml")
+    for scene in plan.scenes:
+        file = cv2.imread(str(folder / "out" / "pictures" / f"{scene.name}.png"))[..., ::-1]
+        np.testing.assert_array_equal(file, sheet(plan, scene, folder / "out"))
+        with np.load(folder / "out" / "pictures" / scene.name / "demo-0.npz") as stored:
+            distance, truth = stored["d"].astype(np.float32), stored["truth"].astype(np.float32)
+        colours = pictures.colour_mapped(distance.copy(), pictures.distance_scale([truth]))
+        factor = -(-320 // distance.shape[1])
+        large = colours.repeat(factor, axis=0).repeat(factor, axis=1)
+        assert shows(file, large), scene.name
+
+
+def shows(picture, part):
+    """Whether a picture has another one in it, at whatever place."""
+    found = cv2.matchTemplate(picture, part, cv2.TM_SQDIFF)
+    return found.min() < 1.0
+
+
+def test_what_is_assumed_is_named_below_the_table():
+    """With a mark at the row, in Markdown and on the page; a row that failed has neither."""
+    plan = Plan(scenes=(Scene(name="demo"),), rows=(Row(preset="ftorf"), Row(preset="best")))
+    found = {
+        "demo/ftorf-0": {"id": "demo/ftorf-0", "metrics": {}, "assumed": ["one guess", "another"]},
+        "demo/best-0": {"id": "demo/best-0", "metrics": {}},
+    }
+    text = table.markdown(plan, found)
+    assert "| demo | ftorf * |" in text
+    assert "| demo | best |" in text
+    assert text.count("\n* ftorf: ") == 2
+    assert "another" in table.html(plan, found, {})
+    failed = {"demo/ftorf-0": {"id": "demo/ftorf-0", "error": "none", "exit_code": 2}}
+    assert "guess" not in table.markdown(plan, failed)
 
 
 def test_the_command_prints_the_table_and_lists_jobs(swept, capsys):

@@ -16,13 +16,13 @@ from ..data import resources
 from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
-from ..data.synchronised import check_flow, has_tap_sums, unfilled_share
+from ..data.synchronised import has_tap_sums, unfilled_share
 from ..errors import InputError, UsageError
 from ..render.cuda import free_memory, on_device
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
-from . import attempts, checkpoint, closed_form, folder, presets, residuals, source
+from . import attempts, checkpoint, folder, presets, residuals, source
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -31,6 +31,7 @@ from .record import Metrics, log_to
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict
+from .suitable import check_sequence, faithfulness, log_faithfulness
 from .volume import fit
 from .volume.loop import VolumeState
 
@@ -104,6 +105,8 @@ def reconstruct(
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
     config |= {"flow": None if flow is None else str(flow), "changes": changes}
+    config |= faithfulness(settings, changes)
+    check_sequence(sequence, settings)
     _check_resources(sequence, settings, out, device)
     with folder.locked(out), on_device(device):
         goes_on = folder.prepare(out, config, fresh=fresh)
@@ -252,6 +255,7 @@ def _choice(kind: type[Choice], name: str, option: str) -> Choice:
 
 
 def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
+    log_faithfulness(settings, config)
     config |= {
         "quad_scale": 1.0,
         "quad_scale_source": "nothing is scaled",
@@ -261,9 +265,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     }
     if not settings.method.fits:
         config |= {"images_optimised": 0, "seconds_reconstruct": 0.0}
-        if settings.method == Method.TEMPORAL:
-            closed_form.check_rests(sequence)
-        elif settings.method == Method.FLOW2D:
+        if settings.method == Method.FLOW2D:
             config |= _synchronise(sequence, settings)
             config["seconds_reconstruct"] = time.monotonic() - begun
         folder.write_config(out, config)
@@ -278,8 +280,6 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
             attempts.conclude(out, known, stored, _judged(sequence, out, device))
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
-    if settings.method.is_volume:
-        fit.check_volume(sequence, settings.method)
     observations = observe(sequence, settings, device)
     _warn(sequence, observations.sequence)
     earlier = 0.0 if stored is None else stored["seconds"]
@@ -299,7 +299,6 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     more = {"seed": seed, "clock": clock, "progress": progress}
     state: VolumeState | State
     if settings.method.is_volume:
-        config |= fit.describe(settings, config["changes"])
         folder.write_config(out, config)
         state = fit.fit(*given, **more)
         found = _judged(sequence, out, device)
@@ -362,8 +361,7 @@ def _fit_gaussians(
 
 
 def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, object]:
-    """What config.json says of method flow2d; refuses sequences that it cannot show."""
-    check_flow(sequence)
+    """What config.json says of method flow2d."""
     share = unfilled_share(sequence, settings.flow.matcher)
     text = "optical flow brought nothing to %.2f %% of the pixels: hidden, or it is wrong there"
     LOG.info(text, 100.0 * share)

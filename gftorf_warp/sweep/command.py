@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from ..data.files import atomic_write, write_json
+from ..data.images import png_bytes
 from ..data.lock import locked
 from ..errors import UsageError
 from . import table
 from .cluster import Cluster
 from .job import Result, Task, do
 from .plan import Job, Plan, read_plan
+from .sheet import sheet
 from .workers import Lost, Workers, places
 
 LOG = logging.getLogger("gftorf_warp")
 STORE, NUMBERS, TABLE, PAGE = "results.jsonl", "sweep.json", "sweep.md", "sweep.html"
+PICTURES = "pictures"
 Progress = Callable[..., None]
 
 
@@ -36,7 +39,7 @@ def sweep(
     What is done with the same settings and data is not done again, and a run that was interrupted
     goes on from its checkpoint: the same call continues a sweep. OUT has ``scenes/``, ``runs/``
     (folders of ordinary runs), ``results.jsonl`` (a line per job, as they are ready), and at the
-    end ``sweep.md``, ``sweep.json`` and ``sweep.html``.
+    end ``sweep.md``, ``sweep.json``, ``sweep.html`` and ``pictures/SCENE.png``.
 
     Args:
         plan: What to do, or its TOML file.
@@ -79,7 +82,11 @@ def sweep(
         wanted = {job.id: results[job.id] for job in (*plan.recordings, *plan.fits)}
         write_json(out / NUMBERS, list(wanted.values()))
         atomic_write(out / TABLE, table.markdown(plan, wanted).encode())
-        atomic_write(out / PAGE, table.html(plan, wanted, out).encode())
+        sheets = {scene.name: sheet(plan, scene, out) for scene in plan.scenes}
+        for name, picture in sheets.items():
+            if picture is not None:
+                atomic_write(out / PICTURES / f"{name}.png", png_bytes(picture))
+        atomic_write(out / PAGE, table.html(plan, wanted, sheets).encode())
     return wanted
 
 

@@ -121,6 +121,7 @@ def _fitted(task: Task, place: Place) -> Result:
     _keep_picture(picture_of(job, task.out), found)
     memory = peak_memory(place.device)
     about = {"seconds": run.config.get("seconds_reconstruct"), "gaussians": run.gaussians}
+    about |= {name: run.config[name] for name in ("assumed",) if name in run.config}
     return {"key": key, "metrics": metrics, **about, "memory_mib": memory and memory / 2**20}
 
 

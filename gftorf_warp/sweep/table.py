@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from ..evaluate import page, pictures
-from .job import Result, picture_of
-from .plan import Job, Plan, Scene
+from ..evaluate import page
+from ..evaluate.captioned import Picture
+from .job import Result
+from .plan import Plan, Scene
+from .sheet import CLOSED_FORM
 
 COLUMNS = {  # title: where it is in metrics.json
     "all": "d_mse_x100",
@@ -23,9 +24,9 @@ COLUMNS = {  # title: where it is in metrics.json
 }
 ERRORS = ("all", "moving", "static", "d_ToF")
 COSTS = {"seconds": "seconds", "GPU MiB": "memory_mib", "Gaussians": "gaussians"}
-CLOSED_FORM = "closed form"
 UNIT = "mean squared errors of the distance along the ray x 100 [m^2]"
 NONE = "-"
+MARK = " *"  # behind the name of a row that is not all as published
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +81,18 @@ def failures(results: Iterable[Result]) -> list[str]:
     return [f"{result['id']}: {result['error']}" for result in results if "error" in result]
 
 
+def assumptions(plan: Plan, results: Mapping[str, Result]) -> dict[str, list[str]]:
+    """What was not published, or is done in another way, by row; rows that all publish, or nobody
+    does, have none.
+    """
+    notes: dict[str, list[str]] = {}
+    for job in plan.fits:
+        assumed = results.get(job.id, {}).get("assumed")
+        if job.row is not None and assumed:
+            notes.setdefault(job.row.name, [f"{job.row.name}: {each}" for each in assumed])
+    return notes
+
+
 def exit_code(results: Iterable[Result]) -> int:
     """0 if every job is done, else the largest exit code of those that failed."""
     return max((result["exit_code"] for result in results if "error" in result), default=0)
@@ -92,12 +105,14 @@ def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
     for line in [*lines_of(plan, results), *over_scenes(plan, results)]:
         cells = (line.cells.get(title, NONE) for title in [*COLUMNS, *COSTS])
         text.append(_row([line.scene, line.row, *cells]))
+    for notes in assumptions(plan, results).values():
+        text += ["", *(f"* {note}" for note in notes)]
     text += [f"\nfailed: {failure}" for failure in failures(results.values())]
     return "\n".join(text) + "\n"
 
 
-def html(plan: Plan, results: Mapping[str, Result], out: Path) -> str:
-    """The tables as an offline page, with pictures of the first seed of every row."""
+def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture | None]) -> str:
+    """The tables as an offline page, with the picture of every scene."""
     body = "<header><h1>Sweep</h1></header>"
     about = page.caption(page.escape(_about(plan)))
     body += page.section("Over the closed form", about, _html(over_scenes(plan, results), ERRORS))
@@ -107,8 +122,12 @@ def html(plan: Plan, results: Mapping[str, Result], out: Path) -> str:
     lines = lines_of(plan, results)
     for scene in plan.scenes:
         own = [line for line in lines if line.scene == scene.name]
-        shown = _html(own, [*COLUMNS, *COSTS]), _pictures(plan, scene, out)
-        body += page.section(page.escape(scene.name), *shown)
+        picture = sheets.get(scene.name)
+        shown = "" if picture is None else page.plain_picture(picture, scene.name, "all rows")
+        body += page.section(page.escape(scene.name), _html(own, [*COLUMNS, *COSTS]), shown)
+    if notes := assumptions(plan, results):
+        items = (f"<li>{page.escape(note)}</li>" for row in notes.values() for note in row)
+        body += page.section("Not as published (*)", f"<ul>{''.join(items)}</ul>")
     return page.document("Sweep", body)
 
 
@@ -158,7 +177,8 @@ def _line(scene: Scene, name: str, found: Sequence[Result]) -> Line:
         values = [result[key] for result in found if result.get(key) is not None]
         if values:
             cells[title] = f"{np.mean(values):{'.1f' if title == 'seconds' else '.0f'}}"
-    return Line(scene=scene.name, row=name, cells=cells, kind="ours")
+    marked = name + MARK if any(result.get("assumed") for result in found) else name
+    return Line(scene=scene.name, row=marked, cells=cells, kind="ours")
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -188,27 +208,3 @@ def _of(known: int, scenes: int) -> str:
 
 def _row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
-
-
-def _pictures(plan: Plan, scene: Scene, out: Path) -> str:
-    """Distance of every row on a scene, beside truth and closed form; their errors below."""
-    jobs = [Job(scene=scene, row=row, seed=plan.seeds[0]) for row in plan.rows]
-    images = {}
-    for job in jobs:
-        if job.row is not None and (path := picture_of(job, out)).is_file():
-            with np.load(path) as stored:
-                images[job.row.name] = {k: stored[k].astype(np.float32) for k in stored.files}
-    if not images:
-        return ""
-    first = next(iter(images.values()))
-    scale = pictures.distance_scale([first.get("truth", first["closed_form"])])
-    shown = {"truth": first["truth"]} if "truth" in first else {}
-    shown |= {CLOSED_FORM: first["closed_form"]} | {k: each["d"] for k, each in images.items()}
-    html = page.row([page.picture(image, scale, title) for title, image in shown.items()])
-    if "closed_form_error" in first:
-        errors = {CLOSED_FORM: first["closed_form_error"]}
-        errors |= {name: each["error"] for name, each in images.items() if "error" in each}
-        scale = pictures.error_scale([first["closed_form_error"]])
-        figures = [page.picture(image, scale, title, "|error|") for title, image in errors.items()]
-        html += page.row(figures, len(shown))
-    return html
