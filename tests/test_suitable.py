@@ -76,7 +76,7 @@ def test_check_names_what_is_assumed(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "preset ftorf can be applied" in said
     assert "assumed         optical flow" in said
-    assert main(["check", str(tmp_path / "box"), "--preset", "dgs"]) == 2
+    assert main(["check", str(tmp_path / "box"), "--preset", "dgs"]) == 3
     found = capsys.readouterr()
     assert "sequence" in found.out
     assert "no colour" in found.err
