@@ -126,8 +126,8 @@ def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture
         shown = "" if picture is None else page.plain_picture(picture, scene.name, "all rows")
         body += page.section(page.escape(scene.name), _html(own, [*COLUMNS, *COSTS]), shown)
     if notes := assumptions(plan, results):
-        items = (f"<li>{page.escape(note)}</li>" for row in notes.values() for note in row)
-        body += page.section("Not as published (*)", f"<ul>{''.join(items)}</ul>")
+        listed = "".join(f"<li>{page.escape(n)}</li>" for row in notes.values() for n in row)
+        body += page.section("Not as published (*)", f"<ul>{listed}</ul>")
     return page.document("Sweep", body)
 
 
