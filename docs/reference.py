@@ -35,10 +35,11 @@ def write(folder: Path) -> None:
 
 
 def table(*heads: str, rows: list[tuple[str, ...]]) -> str:
-    """A Markdown table."""
+    """A Markdown table whose cells lie below each other on a phone, see site.css."""
     lines = [heads, ("---",) * len(heads), *rows]
     cells = ([" ".join(cell.split()).replace("|", "\\|") for cell in line] for line in lines)
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"
+    text = "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    return f"```{{rst-class}} stacked\n```\n\n{text}\n"
 
 
 def commands() -> str:
