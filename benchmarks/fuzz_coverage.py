@@ -6,9 +6,9 @@ kept and changed further. The random form, which needs no package, is benchmarks
 
 An input is a number, which file of the reader's folder it replaces, and the bytes of that file; the
 first ones are the whole files of tests/damaged_files.py. An error of errors.py is what damage
-should end in. Anything else ends the process of its reader and is a finding, whose input is in
-DIR/READER/found-*, as is one that takes ten seconds or 4 GB; hash-protected files are left to
-fuzz.py. Inputs stay in DIR/READER/, so that the next call goes on from them. Prints a row per
+should end in. Anything else ends the process of its reader and is a finding, as is an input that
+takes ten seconds or 4 GB: DIR/READER/found-*. Files that a hash protects are left to fuzz.py. What
+reached new lines stays in DIR/READER/inputs, from which the next call goes on. Prints a row per
 reader; the exit code is 1 if there is a finding.
 """
 
@@ -26,7 +26,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-READ_BY = ("data", "importers", "sim.mesh_file", "sim.scene_file", "recon.checkpoint")
+OURS = ("data", "importers", "scene.falloff", "sim.mesh_file", "sim.scene_file")
+OTHERS = ("tomllib", "trimesh.exchange", "numpy.lib.format", "numpy.lib._format_impl")
 LIMITS = ("-timeout=10", "-rss_limit_mb=4096", "-max_len=262144", "-reload=0")
 ENDED = re.compile(r"cov: (\d+) .*corp: (\d+)/")
 RUNS = re.compile(r"stat::number_of_executed_units: (\d+)")
@@ -36,15 +37,16 @@ def fuzz(name: str, corpus: Path, seconds: int) -> None:
     """Fuzz one reader until the time is over or something is found; ends the process."""
     import atheris
 
-    included = [f"gftorf_warp.{part}" for part in READ_BY]
+    logging.disable()
+    included = [*(f"gftorf_warp.{part}" for part in OURS), *OTHERS]
     with atheris.instrument_imports(include=included):
         from damaged_files import READERS, whole
 
         from gftorf_warp.errors import GftorfError
 
-    logging.disable()
-    reader, place = READERS[name], Path(tempfile.mkdtemp()) / "files"
-    shutil.copytree(whole(name), place)
+        reader, place = READERS[name], Path(tempfile.mkdtemp()) / "files"
+        shutil.copytree(whole(name), place)
+        reader.read(place)  # imports what it needs
     files = [path for path in sorted(place.glob(reader.damaged)) if path.is_file()]
     contents = [path.read_bytes() for path in files]
     for number, content in enumerate(contents):
