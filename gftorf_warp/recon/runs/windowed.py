@@ -77,9 +77,11 @@ class WindowedRun(WithoutGaussians):
         def fitted(window: Run, local: float) -> Rendering:
             if isinstance(window, WithoutGaussians):
                 return window.render(local, camera, f_mod_hz=f_mod_hz)
-            return gaussians.rendering_of(window, local, camera, extra=None, f_mod_hz=f_mod_hz)
+            view = camera or self.camera
+            return gaussians.rendering_of(window, local, view, extra=None, f_mod_hz=f_mod_hz)
 
-        rendering = self.corrected(self.joined.rendered(time, fitted), time, camera, f_mod_hz)
+        rendering = self.joined.rendered(time, fitted)
+        rendering = self.corrected(rendering, time, camera or self.camera, f_mod_hz)
         return with_empty_extra(rendering, extra)
 
     def renderer(
