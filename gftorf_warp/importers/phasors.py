@@ -83,23 +83,25 @@ def as_raw_frames(phasors: Sequence) -> Sequence:
     the four raw frames of each.
     """
 
-    def four(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else np.repeat(values, FRAMES_PER_QUARTET, axis=0)
+    def four(values: np.ndarray) -> np.ndarray:
+        return np.repeat(values, FRAMES_PER_QUARTET, axis=0)
 
-    half = phasors.quads / np.float32(2.0)
+    half, colour = phasors.quads / np.float32(2.0), phasors.colour
     quads = np.stack([half.real, -half.real, half.imag, -half.imag], axis=1)
     frames = FRAMES_PER_QUARTET * len(half)
-    per_frame = ("measured", "times", "exposures", "camera_from_world")
-    colour = phasors.colour
+    exposures, poses = phasors.exposures, colour.camera_from_world
     return replace(
         phasors,
         quads=quads.reshape(frames, *half.shape[1:]),
         shifts=np.resize(CANONICAL_SHIFTS, frames),
-        **{name: four(getattr(phasors, name)) for name in per_frame},
+        measured=four(phasors.measured),
+        times=four(phasors.times),
+        exposures=None if exposures is None else four(exposures),
+        camera_from_world=four(phasors.camera_from_world),
         colour=replace(
             colour,
             images={FRAMES_PER_QUARTET * n: image for n, image in colour.images.items()},
-            camera_from_world=four(colour.camera_from_world),
+            camera_from_world=None if poses is None else four(poses),
         ),
         from_phasors=True,
     )
