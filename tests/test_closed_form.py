@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_box import recording
+from moving_box import recording, with_colour
 
 from gftorf_warp import Sequence
 from gftorf_warp.data.decode import closed_form_distance, quartet_phasor
@@ -164,3 +164,11 @@ def test_what_cannot_be_shown_is_an_error(tmp_path):
     object.__setattr__(sequence, "sequence", lambda: holed)
     with pytest.raises(InputError, match="no complete quartet"):
         sequence.render(0.0)
+
+
+def test_a_recording_with_colour_is_compared(tmp_path):
+    """A closed form has no colour and no other view, so nothing is asked of the colour camera."""
+    path = write("capture", tmp_path / "seq", with_colour(recording(frames=8)[0], size=(12, 9)))
+    run = reconstruct(path, tmp_path / "run", "ctof")
+    assert compare(run)["method"] == "ctof"
+    assert (run.path / "report.html").is_file()

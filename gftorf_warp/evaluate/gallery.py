@@ -88,6 +88,8 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
     Raises:
         DivergedError: If a rendering is not finite.
     """
+    if not run.has_colour:  # a closed form has no other view either
+        return None
     found = []
     for n in (n for n in frames if n in sequence.colour.images):
         camera = colour_camera_of(sequence, n)
