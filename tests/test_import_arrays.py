@@ -15,6 +15,7 @@ from gftorf_warp import Sequence
 from gftorf_warp.cli import main
 from gftorf_warp.data.check import check
 from gftorf_warp.data.decode import closed_form_distance
+from gftorf_warp.data.pictures import read_picture
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.importers.command import read_recording
 
@@ -585,3 +586,18 @@ def test_a_flipped_bit_never_crashes(writer, tmp_path):
         except (InputError, UsageError) as error:
             refused += "fix" in str(error)
     assert refused > 3
+
+
+@pytest.mark.parametrize("damage", ["a byte", "the end"])
+def test_a_damaged_png_is_named_and_nothing_else_is_printed(tmp_path, capfd, damage):
+    """By the sum of its part, before a decoder sees it."""
+    path = tmp_path / "a.png"
+    values = np.random.default_rng(0).integers(0, 60_000, (64, 64)).astype(np.uint16)
+    assert cv2.imwrite(str(path), values)
+    assert np.array_equal(read_picture(path)[0], values)
+    data = bytearray(path.read_bytes())
+    data[3000] ^= 0x55
+    path.write_bytes(data if damage == "a byte" else data[:2000])
+    with pytest.raises(InputError, match="whole PNG"):
+        read_picture(path)
+    assert capfd.readouterr() == ("", "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,8 +66,29 @@ def _png_size(path: Path, data: bytes) -> tuple[int, int]:
     """Width and height in the header of a PNG file."""
     if len(data) < 24:
         raise unreadable(path, f"expected a PNG file, found {len(data)} bytes")
+    _check_sums(path, data)
     width, height = struct.unpack_from(">2I", data, 16)
     return width, height
+
+
+def _check_sums(path: Path, data: bytes) -> None:
+    """Check the CRC of every part of a PNG file: libpng prints to stderr about damaged ones, and
+    may return what it could decode.
+
+    Raises:
+        InputError: If one is another than stored, or the file ends before its last part.
+    """
+    start, kind = len(PNG), b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data.ljust(start + 8, b"\0"), start)
+        end = start + 8 + length
+        stored = data[end : end + 4]
+        if len(stored) < 4:
+            raise unreadable(path, f"expected a whole PNG file, found its first {len(data)} bytes")
+        if zlib.crc32(data[start + 4 : end]) != int.from_bytes(stored, "big"):
+            name = kind.decode("ascii", "replace")
+            raise unreadable(path, f"expected a whole PNG file, found a damaged part {name!r}")
+        start = end + 4
 
 
 def _tiff_sizes(path: Path, data: bytes) -> list[tuple[int, int]]:

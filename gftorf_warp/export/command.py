@@ -167,9 +167,8 @@ def check_resources(moments: Moments, names: Iterable[str], out: Path) -> None:
         ResourceError: If not.
     """
     run, camera = moments.run, moments.cameras[0]
-    layer = run.field.layer
-    windows = isinstance(run.motion, Windows) and layer is not None
-    always = int((layer == 0).sum()) if windows else len(run.field)
+    layer = run.field.layer if isinstance(run.motion, Windows) else None
+    always = len(run.field) if layer is None else int((layer == 0).sum())
     size = len(moments), camera.width * camera.height, always
     need = resources.to_export([FORMATS[name].needs for name in names], *size)
     resources.require(need, out, "write fewer moments, --every 4 or --times, or fewer formats")
