@@ -528,7 +528,7 @@ BAD = [  # change of the folder, changed keys, a word of the error
     (only("a.png", COLOUR), {}, "one channel, found 3"),
     (only("a.png", bytes(HUGE_PNG)), {}, "1 to 8192 pixels"),
     (only("a.png", COLOUR[:20]), {}, "20 bytes"),
-    (only("a.png", COLOUR[:80]), {}, "whole pages"),
+    (only("a.png", COLOUR[:80]), {}, "whole PNG"),
     (only("a.tif", b"II*\0\x08"), {}, "a PNG or a TIFF"),
     (only("a.tif", ROUND_TIFF), {}, "a circle"),
     (only("a.tif", b"II+\0" + bytes(40)), {}, "BigTIFF"),

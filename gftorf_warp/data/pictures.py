@@ -45,6 +45,8 @@ def read_picture(path: Path) -> np.ndarray:
     if not within or len(sizes) > FRAMES_MAX:
         found = f"{len(sizes)} pages, the first of {sizes[0]}"
         raise unreadable(path, f"expected 1 to {SIDE_MAX} pixels a side, found {found}")
+    if data.startswith(PNG):
+        _check_sums(path, data)
     try:
         pixels = sum(width * height for width, height in sizes)
         check_unpacked(BYTES_PER_PIXEL * pixels, len(data))
@@ -66,7 +68,6 @@ def _png_size(path: Path, data: bytes) -> tuple[int, int]:
     """Width and height in the header of a PNG file."""
     if len(data) < 24:
         raise unreadable(path, f"expected a PNG file, found {len(data)} bytes")
-    _check_sums(path, data)
     width, height = struct.unpack_from(">2I", data, 16)
     return width, height
 
