@@ -25,7 +25,7 @@ def write(folder: Path) -> None:
     (folder / "examples.md").write_text(text, encoding="utf-8")
     with tempfile.TemporaryDirectory() as temporary:
         for name in SCENES:
-            path = simulate(name, Path(temporary) / name, frames=12, size=(128, 96))
+            path = simulate(name, Path(temporary) / name, frames=12, size=(128, 96), engine="mesh")
             shutil.copyfile(path / SHEET, folder / f"scene-{name}.png")
 
 
