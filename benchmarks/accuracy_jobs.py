@@ -40,6 +40,7 @@ from gftorf_warp.recon.observations import data_hash, input_of
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Input, Method, ReconSettings, plain
 from gftorf_warp.recon.train import CHANGES
+from gftorf_warp.render.cuda import forget_peak_memory, peak_memory
 from gftorf_warp.scene.changes import changed
 from gftorf_warp.sim.exposure import pooled as averaged
 from gftorf_warp.sim.mesh_engine import MeshEngine
@@ -162,8 +163,7 @@ class Fits:
         if alike not in self._runs:
             folder = self.setup.out / "runs" / job.id(self.setup).replace("/", "_")
             shutil.rmtree(folder, ignore_errors=True)
-            if torch.device(self.setup.device).type == "cuda":
-                torch.cuda.reset_peak_memory_stats(self.setup.device)
+            forget_peak_memory(self.setup.device)
             given = {"seed": job.seed, "device": self.setup.device}
             self._runs[alike] = reconstruct(sequence, folder, settings, **given)
         run = self._runs[alike]
@@ -269,6 +269,7 @@ def _fitted(job: Job, setup: Setup, known: str | None, fits: Fits) -> Result | N
     run = fits.run(job, sequence, settings)
     scores = compare(run, report=False)
     _draw(job, setup, run, sequence, scores)
+    peak = peak_memory(setup.device)
     result = {
         "row": job.row.name,
         "key": key,
@@ -277,9 +278,7 @@ def _fitted(job: Job, setup: Setup, known: str | None, fits: Fits) -> Result | N
         "gaussians": run.gaussians,
         "rise": _rise(run.path),
         "attempts": len(run.config.get("attempts", [1])),
-        "memory_mib": torch.cuda.max_memory_allocated(setup.device) / 2**20
-        if kind == "cuda"
-        else None,
+        "memory_mib": peak and peak / 2**20,
     }
     return result
 

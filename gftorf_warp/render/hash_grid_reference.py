@@ -25,7 +25,7 @@ def interpolated(
         along = points.clamp(0.0, 1.0) * cells
         first = along.detach().floor().clamp_max(cells - 1)
         share = along - first
-        total = 0.0
+        total = table.new_zeros(())
         for corner in itertools.product((0, 1), repeat=3):
             far = torch.tensor(corner, device=points.device)
             weight = torch.where(far == 1, share, 1.0 - share).prod(dim=-1)
