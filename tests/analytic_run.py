@@ -138,7 +138,7 @@ class AnalyticRun:
         self.sensor = Sensor()
         self.quad_scale = 1.0
         self.gaussians = 1234
-        self.colour = colour
+        self.has_colour = colour
         self.cameras = []  # every camera that was rendered from
         self.config = {
             "version": "0.0.9",
@@ -214,7 +214,7 @@ class AnalyticRun:
         return Rendering(
             quads=tensor(quads),
             phasor=tensor(phasor),
-            colour=tensor(2.0 * in_colour(right) + COLOUR_ERROR) if self.colour else None,
+            colour=tensor(2.0 * in_colour(right) + COLOUR_ERROR) if self.has_colour else None,
             distance=tensor(distance),
             opacity=tensor(np.full_like(distance, OPACITY)),
             distortion=tensor(np.zeros_like(distance)),

@@ -474,14 +474,17 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
 
 
 def test_export_prints_what_it_wrote(run, tmp_path, capsys):
-    """A folder per format; a second one is refused."""
+    """A folder per format; the same command says that all is there, another one is refused."""
     out_folder = tmp_path / "exported"
-    arguments = ["export", str(run), "--out", str(out_folder), "--times", "0.0,0.021"]
-    assert cli.main([*arguments, "--device", "cpu"]) == 0
-    out, _ = lines_of(capsys)
-    assert out == [str(out_folder / "ply")]
-    assert len(list((out_folder / "ply").glob("frame_*.ply"))) == 2
-    fails(arguments, 2, capsys, "--fresh")
+    arguments = ["export", str(run), "--out", str(out_folder), "--device", "cpu", "--times"]
+    said = f"{out_folder / 'ply'} is finished"
+    for repeated in (False, True):
+        assert cli.main([*arguments, "0.0,0.021"]) == 0
+        out, err = lines_of(capsys)
+        assert out == [str(out_folder / "ply")]
+        assert (said in err) == repeated
+        assert len(list((out_folder / "ply").glob("frame_*.ply"))) == 2
+    fails([*arguments, "0.0"], 2, capsys, str(out_folder / "ply"), "--fresh")
 
 
 def test_compare_prints_a_table_or_json(run, sequence, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from ..scene.windows import Windows
 from . import cameras, film, images, listed, mesh, points, scene_page, splats
 from .moments import Moments, Progress
 
+LOG = logging.getLogger("gftorf_warp")
 COLOURS = ("colour", "reflectivity")
 
 
@@ -109,7 +111,10 @@ def export(
     }
     missing = [name for target, name in targets.items() if fresh or not target.exists()]
     check_resources(moments, missing, out)
-    for target in listed.remaining(out, asked, fresh=fresh):
+    remaining = listed.remaining(out, asked, fresh=fresh)
+    for target in (target for target in targets if target not in remaining):
+        LOG.info("%s is finished", target)
+    for target in remaining:
         kind = FORMATS[targets[target]]
         write = functools.partial(kind.write, **{"colour": shown} if kind.coloured else {})
         step = progress(targets[target]) if progress else lambda *_: None
