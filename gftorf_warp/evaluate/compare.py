@@ -289,8 +289,8 @@ def installed_versions() -> str:
 
 
 def sequence_title(path: Path | None) -> str | None:
-    """Title of a sequence: the heading of its README.md, else the name of its folder."""
-    first = _data_card(path).partition("\n")[0]
+    """Title of a sequence: the heading of its README.md as text, else the name of its folder."""
+    first = _data_card(path).partition("\n")[0].replace("`", "")
     if first.startswith("# "):
         return first.removeprefix("# ").strip()
     return None if path is None else path.name
