@@ -12,6 +12,10 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
   to explain them still better. A fit that explains no more than black images do is replaced
   wherever it fails.
 
+A moving camera has no temporal mean, and its fits are worse: there the closed form replaces the
+distance of a pixel wherever one phasor explains its quads, or explains them as well as the fit
+does. Raw frames that were made from phasors are explained by one whatever moved, and prove nothing.
+
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
 a fit between the two sides stays if it explains the quads.
 
@@ -42,7 +46,7 @@ from ..scene.measured import extremes
 from ..scene.sensor import quad_from_phasor
 from . import closed_form
 from .collapse import NEAR
-from .residuals import Residuals
+from .residuals import CHI_SQUARE_MAX, Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
@@ -107,11 +111,13 @@ class Fallback:
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
-        needed = np.where(_supported(alone), odds, odds**2)
-        needed = np.where(_is_useless(found, sequence, noise), 0.0, needed)
-        moved = (
-            ~agrees & (count == 1) & ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
-        )
+        if temporal.camera_rests(sequence) or sequence.from_phasors:
+            needed = np.where(_supported(alone), odds, odds**2)
+            needed = np.where(_is_useless(found, sequence, noise), 0.0, needed)
+            moved = ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
+            moved &= ~agrees & (count == 1)
+        else:  # a chi-square that is not finite is none
+            moved = (of_phasor <= CHI_SQUARE_MAX) | ~(chi_square < of_phasor)
         count = np.where(agrees, agrees.sum(axis=0), count)
         stays = math.sqrt(2.0 * math.log(_odds(found.contradicted_share, found)))
 
