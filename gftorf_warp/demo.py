@@ -13,7 +13,6 @@ from .errors import UsageError
 from .terminal import LOG
 
 SCENE = "demo"
-ENGINE = "mesh"  # its pixels average what they see, as those of a camera do
 PRESET = "best"
 SETTINGS = "demo.json"
 OURS = (SETTINGS, "seq", "run", "metrics.json", "report.html")
@@ -63,13 +62,7 @@ def demo(
 
     with _Step("[1/4] simulate   ") as step:
         path = simulate(
-            SCENE,
-            out / "seq",
-            frames=frames,
-            size=size,
-            seed=seed,
-            engine=ENGINE,
-            progress=report("simulate"),
+            SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate")
         )
         sequence = read(path)
         size_of = f"{sequence.width}x{sequence.height}, {sequence.frames} raw frames"
