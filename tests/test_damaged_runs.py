@@ -146,6 +146,7 @@ def test_a_report_of_a_later_state_is_not_replaced(place, capsys):
         ("a factor of all quads", '\n  "quad_scale": ', '\n  "quad_scale": 1'),
         ("a digit of the camera", '"fx": ', '"fx": 1'),
         ("a setting that a rendering reads", '"low_pass": 0.3', '"low_pass": 0.8'),
+        ("a number that JSON lacks", '"fx": ', '"fx": NaN, "was": '),
         ("the sum itself", '"config_sha256": "', '"config_sha256": "f'),
     ],
 )

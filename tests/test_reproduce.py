@@ -45,11 +45,12 @@ def test_a_stated_result_can_be_done_again(row):
 
 @pytest.mark.parametrize("row", ROWS.values(), ids=list(ROWS))
 def test_a_stated_result_is_that_of_its_page(row):
-    """Every mean is on the page, with four digits."""
+    """Every mean is on the page, with four digits or, as in tables of benchmarks, with three."""
     text = (ROOT / row.page).read_text()
     written = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", text)}
-    means = {key: float(f"{row.bounds(key)[1]:.4g}") for key in row.values}
-    assert not {key: mean for key, mean in means.items() if mean not in written}
+    means = {key: row.bounds(key)[1] for key in row.values}
+    rounded = {key: {float(f"{mean:.{n}g}") for n in (3, 4)} for key, mean in means.items()}
+    assert not {key: means[key] for key, numbers in rounded.items() if not numbers & written}
 
 
 def stated(**values):

@@ -88,11 +88,11 @@ class _Best:
     """The images of the best candidate of every pixel."""
 
     def __init__(self, like: Tensor):
-        self.images: tuple[Float[Tensor, "C h w"], ...] = ()
+        self.images: tuple[Float[Tensor, "_ h w"], ...] = ()
         self._score = like.new_full(like.shape[2:], math.inf)
 
     def update(
-        self, scores: Float[Tensor, "B h w"], images: tuple[Float[Tensor, "B C h w"], ...]
+        self, scores: Float[Tensor, "B h w"], images: tuple[Float[Tensor, "B _ h w"], ...]
     ) -> None:
         """Take the pixels in which candidates, one after the other, are clearly better."""
         chosen = torch.full(scores.shape[1:], -1, device=scores.device)
