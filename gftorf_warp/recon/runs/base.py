@@ -135,7 +135,7 @@ class Run(StoredRun):
         if self.fallback is not None:
             rendering = self.fallback.applied(rendering, time, camera)
         if self.config["settings"].get("outlines"):
-            sensor, measured = at_frequency(self.sensor, f_mod_hz), self.measured_phasors
+            sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
             phasor = None
             if measured is not None:
                 phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
@@ -194,7 +194,7 @@ class Run(StoredRun):
             return None
 
     @functools.cached_property
-    def measured_phasors(self) -> MeasuredPhasors | None:
+    def _measured_phasors(self) -> MeasuredPhasors | None:
         """What was measured of mixed pixels; None for a sequence that cannot be read again, which
         is logged.
         """
