@@ -105,7 +105,8 @@ def public_lines():
     for place in MODULES:
         module = importlib.import_module(f"gftorf_warp.{place}")
         for name, value in sorted(vars(module).items()):
-            own = getattr(value, "__module__", None) == module.__name__
+            home = getattr(value, "__module__", None)  # constants have none
+            own = home == module.__name__ or (home and name in getattr(module, "__all__", ()))
             if own and not name.startswith("_") and id(value) not in known:
                 found += lines_of(f"gftorf_warp.{place}.{name}", value)
     return found

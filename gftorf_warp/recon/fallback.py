@@ -142,10 +142,8 @@ class Fallback:
         ``source`` is 0 where the fit stays, everywhere if the time [s] is in no complete quartet or
         the camera is another. Nothing is transparent where the distance was replaced.
         """
-        row, fit = (
-            closed_form.row_of(self.sequence, time, camera, self.camera),
-            rendering.distance,
-        )
+        row = closed_form.row_of(self.sequence, time, camera, self.camera)
+        fit = rendering.distance
         if row is None:
             return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)

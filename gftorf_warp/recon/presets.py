@@ -9,21 +9,18 @@ metres here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from ..data.decode import unambiguous_range
-from ..data.sequence import Sequence
-from ..data.temporal import camera_rests
 from ..errors import UsageError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
 from ..scene.initialise import Init, InitSettings
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
+from .recorded import Recorded
 from .settings import (
     Batch,
     BatchRule,
     DensifySettings,
-    FlowSource,
     Input,
     Method,
     Norm,
@@ -32,49 +29,29 @@ from .settings import (
     Schedule,
     Weights,
 )
-from .volume.settings import (
-    PUBLISHED_STEPS,
-    GridSettings,
-    NetworkSettings,
-    TimeCode,
-    VolumeSettings,
-)
+from .volume_presets import ftorf, torf, volume
 
-
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """What a preset may depend on: how a sequence was recorded, never which one it is."""
-
-    input: Input = Input.QUADS
-    """What will be compared, quads or phasors."""
-    unambiguous_range: float = 7.5
-    """Distances are known modulo this [m]."""
-    camera_moves: bool = False
-    """Whether raw frames have different poses."""
-
-    @classmethod
-    def of(cls, sequence: Sequence, wanted: Input) -> Recorded:
-        """How a sequence was recorded, if ``wanted`` is compared with it."""
-        return cls(
-            input=wanted,
-            unambiguous_range=unambiguous_range(sequence),
-            camera_moves=not camera_rests(sequence),
-        )
-
-    @property
-    def scene_scale(self) -> float:
-        """S = 1.1 unambiguous ranges [m], in which the released code gives lengths:
-        8.25 m at 20 MHz.
-        """
-        return 1.1 * self.unambiguous_range
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """z-depths that hold everything [m]: 0.018 unambiguous ranges to 0.99,
-        for phasors 1.21 (sections 2.2, 6.3).
-        """
-        far = 1.21 if self.input == Input.PHASOR else 0.99
-        return 0.018 * self.unambiguous_range, far * self.unambiguous_range
+__all__ = [
+    "ABLATIONS",
+    "PRESETS",
+    "Recorded",
+    "ablated",
+    "best",
+    "ctof",
+    "demo",
+    "dgs",
+    "dgs_depth",
+    "fast",
+    "flow2d",
+    "ftorf",
+    "paper",
+    "preset",
+    "released",
+    "shortened",
+    "temporal",
+    "torf",
+    "volume",
+]
 
 
 def best(recorded: Recorded = Recorded()) -> ReconSettings:
@@ -309,76 +286,6 @@ def flow2d(recorded: Recorded = Recorded()) -> ReconSettings:
     return replace(ctof(recorded), preset="flow2d", method=Method.FLOW2D)
 
 
-def torf(recorded: Recorded = Recorded()) -> ReconSettings:
-    """Neural volumes of phasors and colour: two networks blended (section 7), as our own code.
-    Values are those of its real scenes; recon/volume/torf.py says what is assumed.
-    """
-    return ReconSettings(
-        preset="torf",
-        method=Method.TORF,
-        input=Input.PHASOR,
-        flow=FlowSource.NONE,
-        init=InitSettings(kind=Init.RANDOM),
-        volume=VolumeSettings(
-            network=NetworkSettings(time_code=TimeCode.LEARNT, static=True),
-            rays=1024,
-            accumulated=1,
-            falloff=0.5 * (2.0 * recorded.unambiguous_range / FALLOFF_RANGE) ** 2,
-            rate=1e-3,
-            rate_tenth_after=250_000,
-            gradient_max=None,
-            quads_fall_at=125_000,
-        ),
-        weights=Weights(quads=8.0, ssim=0.0, colour=2.0),
-        schedule=Schedule(images=PUBLISHED_STEPS),
-    )
-
-
-def ftorf(recorded: Recorded = Recorded()) -> ReconSettings:
-    """A neural volume of raw quads with 3D scene flow (section 7), as our own code. Values are
-    those of its real scenes; recon/volume/ftorf.py says what is assumed. Needs a resting camera.
-    """
-    return ReconSettings(
-        preset="ftorf",
-        method=Method.FTORF,
-        input=Input.QUADS,
-        init=InitSettings(kind=Init.RANDOM),
-        volume=VolumeSettings(falloff=(2.0 * recorded.unambiguous_range / FALLOFF_RANGE) ** 2),
-        weights=Weights(quads=10.0, ssim=0.0, flow=0.01),
-        schedule=Schedule(images=PUBLISHED_STEPS),
-    )
-
-
-def volume(recorded: Recorded = Recorded()) -> ReconSettings:
-    """A neural volume of our own in minutes: losses and scene flow of ``ftorf`` with hash grids
-    (recon/volume/grid_volume.py). Needs a resting camera.
-    """
-    base = ftorf(recorded)
-    assert base.volume is not None
-    scene_flow = replace(base.volume.scene_flow, simultaneous_share=0.1)
-    return replace(
-        base,
-        preset="volume",
-        method=Method.VOLUME,
-        volume=replace(
-            base.volume,
-            grid=GridSettings(),
-            scene_flow=scene_flow,
-            rays=8192,
-            accumulated=1,
-            samples=48,
-            density_noise=0.0,
-            rate=1e-2,
-            rate_tenth_after=GRID_STEPS,
-            gradient_max=None,
-            epsilon=1e-15,
-        ),
-        schedule=Schedule(images=GRID_STEPS),
-    )
-
-
-GRID_STEPS = 6000  # of ``volume``
-FALLOFF_RANGE = 7.5  # [m] F of the published synthetic scenes, at which falloffs are L^2 / F^2
 DEPTH_WEIGHT = 0.1  # [1/m] unpublished
 # [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
 DISTORTION_WEIGHT = 1e-3
