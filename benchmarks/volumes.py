@@ -1,14 +1,15 @@
 """What a step of a neural volume costs at the published size, and what a whole run would take.
 
-    python benchmarks/volumes.py [--preset ftorf|torf|volume] [--steps N]
+    python benchmarks/volumes.py [--preset ftorf|torf|volume] [--steps N] [--graph on|off ..]
                                  [--products float32|half ..] [--device cpu|cuda] [--sequence SEQ]
                                  [--set NAME=VALUE ..] [--profile] [--json FILE]
 
 Without a sequence, 60 raw frames of ``sliding_cube`` are simulated. Each row times N steps, updates
-of Adam included, after a warm-up of a tenth as many: for ``ftorf`` and ``volume`` those in which a
-quartet is simultaneous and those with scene flow, for ``torf`` all alike. ``whole run``
-extrapolates to the steps of the preset; ``image`` is the rendering of one raw frame at the size of
-the sequence. With ``--profile`` what ran longest in ten steps is listed under every row.
+of Adam included, as CUDA graphs or launched one by one, after a warm-up of a third as many: for
+``ftorf`` and ``volume`` those in which a quartet is simultaneous and those with scene flow, for
+``torf`` all alike. ``whole run`` extrapolates to the steps of the preset; ``image`` is the
+rendering of one raw frame at the size of the sequence. With ``--profile`` what ran longest in ten
+steps is listed above every row, and how long the device was busy in each.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.settings import Input, ReconSettings
 from gftorf_warp.recon.train import CHANGES
-from gftorf_warp.recon.volume.loop import VolumeLoop, VolumeState, begin
+from gftorf_warp.recon.volume.loop import VolumeLoop
 from gftorf_warp.recon.volume.render import rendering_of
+from gftorf_warp.recon.volume.state import VolumeState, begin
+from gftorf_warp.recon.volume.step import VolumeStep
 from gftorf_warp.recon.volume.targets import Targets
 from gftorf_warp.scene.changes import changed
 from gftorf_warp.scene.measured import camera_of, sensor_of
@@ -40,6 +43,7 @@ from gftorf_warp.scene.motion import Products
 from gftorf_warp.sim.simulate import simulate
 
 PROFILED_STEPS, PROFILED_LINES = 10, 20
+WARM_UP = 3  # so many times fewer steps than are timed: nearly always all graphs are captured
 NOTHING = Path("no folder: neither rows nor checkpoints are written")
 
 
@@ -48,11 +52,13 @@ def main() -> None:
     options = parsed()
     with tempfile.TemporaryDirectory() as folder:
         sequence = recorded(options.sequence, Path(folder))
-    rows = []
+    rows, settings = [], settings_of(options.preset, sequence, "float32", options.set)
+    targets = Targets(observe(sequence, settings, options.device))
     for products in options.products:
-        settings = settings_of(options.preset, sequence, products, options.set)
-        rows.append(measured(sequence, settings, options))
-        print(line(rows[-1]), flush=True)
+        for graph in options.graph:
+            settings = settings_of(options.preset, sequence, products, options.set)
+            rows.append(measured(targets, replace(settings, graph=graph == "on"), options))
+            print(line(rows[-1]), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps({**about(options.device), "rows": rows}, indent=2))
 
@@ -63,12 +69,15 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--preset", choices=("ftorf", "torf", "volume"), default="ftorf")
     parser.add_argument("--steps", type=int, default=200, help="of each kind")
     parser.add_argument("--products", nargs="+", default=["float32", "half"])
+    parser.add_argument("--graph", nargs="+", choices=("on", "off"), help="default: on CUDA both")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--sequence", help="folder; simulated otherwise")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json")
-    return parser.parse_args()
+    options = parser.parse_args()
+    options.graph = options.graph or (["off"] if options.device == "cpu" else ["on", "off"])
+    return options
 
 
 def recorded(path: str | None, folder: Path) -> Sequence:
@@ -89,13 +98,13 @@ def settings_of(
 
 
 def measured(
-    sequence: Sequence, settings: ReconSettings, options: argparse.Namespace
+    targets: Targets, settings: ReconSettings, options: argparse.Namespace
 ) -> dict[str, Any]:
     """Seconds per step of each kind, and of an image."""
-    targets = Targets(observe(sequence, settings, options.device))
     device = torch.device(options.device)
     state = begin(settings, targets, 0, device)
-    loop = VolumeLoop(targets, settings, NOTHING, Metrics(NOTHING), lambda: 0.0, None)
+    step = VolumeStep(state, targets, settings)
+    loop = VolumeLoop(step, NOTHING, Metrics(NOTHING), lambda: 0.0, None)
     assert settings.volume is not None
     total = settings.schedule.images
     starts = {"steps": 0}
@@ -107,16 +116,17 @@ def measured(
     seconds = {}
     for name, start in starts.items():
         state.images = start
-        timed(loop, state, max(1, options.steps // 10), device)
-        seconds[name] = timed(loop, state, options.steps, device) / options.steps
+        timed(loop, max(1, options.steps // WARM_UP), device)
+        seconds[name] = timed(loop, options.steps, device) / options.steps
         if options.profile:
-            profile(loop, state, device)
+            profile(loop, device)
     whole = sum(shares[name] * value for name, value in seconds.items()) * total
     return {
         "preset": options.preset,
         "products": str(settings.volume.products),
+        "graph": settings.graph,
         "seconds_per_step": seconds,
-        "seconds_per_image": seconds_per_image(sequence, state, device),
+        "seconds_per_image": seconds_per_image(targets.observations.sequence, state, device),
         "steps": total,
         "hours_whole_run": whole / 3600.0,
         "gigabytes": peak(device),
@@ -124,12 +134,12 @@ def measured(
     }
 
 
-def timed(loop: VolumeLoop, state: VolumeState, steps: int, device: torch.device) -> float:
+def timed(loop: VolumeLoop, steps: int, device: torch.device) -> float:
     """Seconds of some steps, the device included."""
     wait(device)
     begun = time.perf_counter()
     for _ in range(steps):
-        loop.step(state)
+        loop.step()
     wait(device)
     return time.perf_counter() - begun
 
@@ -146,17 +156,19 @@ def seconds_per_image(sequence: Sequence, state: VolumeState, device: torch.devi
     return time.perf_counter() - begun
 
 
-def profile(loop: VolumeLoop, state: VolumeState, device: torch.device) -> None:
-    """Print what ran longest in a few steps, and how many operations a step has."""
+def profile(loop: VolumeLoop, device: torch.device) -> None:
+    """Print what ran longest in a few steps, and what a step costs host and device."""
     kinds = [torch.profiler.ProfilerActivity.CPU]
     kinds += [torch.profiler.ProfilerActivity.CUDA] if device.type == "cuda" else []
     with torch.profiler.profile(activities=kinds) as found:
-        timed(loop, state, PROFILED_STEPS, device)
+        timed(loop, PROFILED_STEPS, device)
     averages = found.key_averages()
     key = "self_cuda_time_total" if device.type == "cuda" else "self_cpu_time_total"
     print(averages.table(sort_by=key, row_limit=PROFILED_LINES, max_name_column_width=60))
     launches = sum(one.count for one in averages if one.key == "cudaLaunchKernel")
-    print(f"kernels launched per step: {launches / PROFILED_STEPS:.0f}")
+    busy = sum(one.self_device_time_total for one in averages) / 1e3
+    print(f"kernels launched one by one, per step: {launches / PROFILED_STEPS:.0f}")
+    print(f"device busy per step: {busy / PROFILED_STEPS:.2f} ms")
 
 
 def wait(device: torch.device) -> None:
@@ -177,7 +189,8 @@ def line(row: dict[str, Any]) -> str:
     steps = ", ".join(f"{n} {1e3 * s:.2f} ms" for n, s in row["seconds_per_step"].items())
     memory = "" if row["gigabytes"] is None else f", {row['gigabytes']:.1f} GB"
     return (
-        f"{row['preset']} {row['products']}: {steps}; whole run of {row['steps']} steps "
+        f"{row['preset']} {row['products']}, graph {'on' if row['graph'] else 'off'}: "
+        f"{steps}; whole run of {row['steps']} steps "
         f"{row['hours_whole_run']:.2f} h; image {row['seconds_per_image']:.2f} s{memory}"
         f"{'' if row['loss_is_finite'] else '; the loss is NOT finite'}"
     )

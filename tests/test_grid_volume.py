@@ -7,6 +7,7 @@ import pytest
 import torch
 from moving_box import recording
 from torch.testing import assert_close
+from volume_steps import terms_of
 
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe, reduced
@@ -90,12 +91,14 @@ def test_what_was_seen_lately_is_occupied():
     found = Occupancy(CELLS)
     point = torch.tensor([[[0.55, 0.55, 0.55]]])
     for step in range(60):
-        found.note(point, torch.tensor([[[0.0]], [[0.5]]]), step)
+        found.note(point, torch.tensor([[[0.0]], [[0.5]]]))
+        found.update(step)
     cube = torch.zeros(10, 10, 10)
     cube[4:7, 4:7, 4:7] = 1.0
     assert_close(found.occupied, cube)
     for step in range(60, 100):
-        found.note(point, torch.zeros(1, 1, 1), step)
+        found.note(point, torch.zeros(1, 1, 1))
+        found.update(step)
     assert found.occupied.sum() == 0.0
 
 
@@ -127,16 +130,16 @@ def test_a_step_compares_some_raw_frames_with_the_weight_of_all():
     """One before and one after the start, at random; on average as all of them."""
     volume, targets, settings = volume_and_targets(reduced(recording(frames=16)[0], 16))
     around = targets.around(2)
-    assert around.frames.tolist() == [8, 5, 6, 7, 9, 10, 11]
+    assert around.frames == (8, 5, 6, 7, 9, 10, 11)
     pairs = set()
     for seed in range(40):
         some = around.some(1, Draw(seed, torch.device("cpu")))
-        start, before, after = some.frames.tolist()
+        start, before, after = some.frames
         pairs.add((before, after))
         assert start == 8
-        assert some.before.item() == pytest.approx((8 - before) / 4)
-        assert some.after.item() == pytest.approx((after - 8) / 4)
-        assert_close(some.shift[2], around.shift[around.frames.tolist().index(after)])
+        assert some.before == pytest.approx([(8 - before) / 4])
+        assert some.after == pytest.approx([(after - 8) / 4])
+        assert some.shift[2] == around.shift[around.frames.index(after)]
     assert pairs == {(b, a) for b in (5, 6, 7) for a in (9, 10, 11)}
     assert around.some(None, Draw(0, torch.device("cpu"))) is around
     targets.quads = torch.zeros_like(targets.quads)
@@ -145,7 +148,7 @@ def test_a_step_compares_some_raw_frames_with_the_weight_of_all():
         grid = replace(GRID, beside=beside, at_rest=0.0)
         volume.settings = replace(volume.settings, grid=grid)
         terms = [
-            volume.terms(targets, 5000, settings, Draw(seed, torch.device("cpu")))
+            terms_of(volume, targets, 5000, settings, Draw(seed, torch.device("cpu")))
             for seed in range(60)
         ]
         found[beside] = float(torch.stack([each["quads"] for each in terms]).detach().mean())
@@ -162,9 +165,9 @@ def test_the_distortion_of_a_ray():
     assert found.item() == pytest.approx(2 * 0.4 * 0.6 * 4.0)
     volume, targets, settings = volume_and_targets(reduced(recording(frames=8)[0], 16))
     draw = Draw(0, torch.device("cpu"))
-    assert "distortion" not in volume.terms(targets, 1, settings, draw)
+    assert "distortion" not in terms_of(volume, targets, 1, settings, draw)
     settings = replace(settings, weights=replace(settings.weights, distortion=0.5))
-    assert volume.terms(targets, 1, settings, draw)["distortion"] > 0.0
+    assert terms_of(volume, targets, 1, settings, draw)["distortion"] > 0.0
 
 
 @pytest.mark.parametrize(
@@ -190,6 +193,7 @@ def test_its_quads_move_with_time():
     volume, targets, _ = volume_and_targets(recording(frames=8)[0])
     torch.nn.init.normal_(volume.field.moving.table, generator=generator())
     points = targets.views.rays(0, torch.arange(5)).at(torch.full((5, 2), 3.0))
-    trunk = volume.trunk(points.expand(3, 5, 2, 3), [0, 1, 0])
+    quartets = torch.tensor([0, 1, 0], dtype=torch.int32)
+    trunk = volume.trunk(points.expand(3, 5, 2, 3), quartets)
     assert_close(trunk[0], trunk[2])
     assert np.abs((trunk[0] - trunk[1]).detach().numpy()).max() > 1e-2

@@ -152,7 +152,7 @@ def test_gradients_of_the_network_agree_with_finite_differences():
     codes = TimeCodes(NETWORK, 8, 4, generator())
     network = VolumeNetwork(NETWORK, codes.size, generator(1)).double()
     points = torch.rand(2, 3, 3, generator=generator(2), dtype=torch.float64).requires_grad_()
-    code = codes([0, 1]).double().requires_grad_()
+    code = codes(torch.tensor([0, 1])).double().requires_grad_()
 
     def values(points, code):
         trunk = network.trunk(points, code)
@@ -175,28 +175,28 @@ def test_the_input_is_joined_as_if_it_were_one_matrix():
     network = VolumeNetwork(NETWORK, codes.size, generator(1))
     points = torch.rand(1, 4, 3, generator=generator(2))
     known = encoded(points[0], NETWORK.position_octaves, columns=24)
-    code = codes([1]).expand(4, -1)
+    code = codes(torch.tensor([1])).expand(4, -1)
     first = torch.cat([network.entry["0"].weight, network.time["0"].weight], dim=1)
     values = torch.relu(torch.cat([known, code], dim=1) @ first.T)
     values = torch.relu(values @ network.hidden["1"].weight.T)
     parts = (network.entry["2"], network.time["2"], network.hidden["2"])
     joined = torch.cat([part.weight for part in parts], dim=1)
     values = torch.relu(torch.cat([known, code, values], dim=1) @ joined.T)
-    assert_close(network.trunk(points, codes([1]))[0], values)
+    assert_close(network.trunk(points, codes(torch.tensor([1])))[0], values)
     bound = math.sqrt(6.0 / (joined.shape[1] + 16))
     assert 0.95 * bound < joined.abs().max() <= bound
 
 
 def test_time_codes():
     """Positional: (K i + 1) / F and its waves; learnt: of length 1, one per quartet."""
-    found = TimeCodes(NETWORK, 10, 4, generator())([0, 2])
+    found = TimeCodes(NETWORK, 10, 4, generator())(torch.tensor([0, 2]))
     assert_close(found[:, 0], torch.tensor([0.1, 0.9]))
     assert found.shape == (2, 1 + 2 * 2)
     learnt = TimeCodes(
         replace(NETWORK, time_code=TimeCode.LEARNT, time_values=7), 10, 4, generator()
     )
     assert learnt.values.shape == (3, 7)
-    assert_close(learnt([0, 2]).norm(dim=1), torch.ones(2))
+    assert_close(learnt(torch.tensor([0, 2])).norm(dim=1), torch.ones(2))
 
 
 def test_rays_and_their_samples():

@@ -1,14 +1,18 @@
 """Runs of neural volumes at toy size: they learn, resume, move, and refuse what they cannot do."""
 
+import gc
 import json
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from moving_box import as_phasors, recording, turned, with_colour
+from torch.testing import assert_close
+from volume_steps import Recorded, terms_of
 from waits import Operations
 
 from gftorf_warp.data.write import write
@@ -21,17 +25,21 @@ from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.runs.volume import VolumeRun
 from gftorf_warp.recon.train import reconstruct
-from gftorf_warp.recon.volume.loop import VolumeLoop, begin, from_dict
+from gftorf_warp.recon.volume.choice import Inputs
+from gftorf_warp.recon.volume.loop import VolumeLoop
 from gftorf_warp.recon.volume.models import VOLUMES, new_volume
 from gftorf_warp.recon.volume.network import Light
 from gftorf_warp.recon.volume.rays import Depths
 from gftorf_warp.recon.volume.settings import NetworkSettings
+from gftorf_warp.recon.volume.state import begin, from_dict
+from gftorf_warp.recon.volume.step import VolumeStep
 from gftorf_warp.recon.volume.targets import Draw, Targets
 from gftorf_warp.scene.motion import Products
 from gftorf_warp.view.controls import about
 from gftorf_warp.view.subject import Subject
 
 NAMES = ("torf", "ftorf", "volume")
+NOWHERE = Path("neither rows nor checkpoints are written")
 
 
 def toy(name, images=40, **changes):
@@ -52,7 +60,7 @@ def toy(name, images=40, **changes):
         occupancy = replace(grid.occupancy, cells=16, update_every=4, warm_up=20)
         grid = replace(grid, **levels, coarsest=4, width=16, values=8, occupancy=occupancy)
     volume = replace(settings.volume, network=network, grid=grid, samples=16, rays=48)
-    volume = replace(volume, accumulated=1, rate=5e-3, **changes)
+    volume = replace(volume, **({"accumulated": 1, "rate": 5e-3} | changes))
     schedule = replace(settings.schedule, images=images, log_every=10)
     return replace(settings, volume=volume, schedule=schedule)
 
@@ -249,12 +257,12 @@ def test_raw_frames_agree_with_the_true_flow_only(speed, low, high):
     phase = 4.0 * np.pi / 15.0 * distance - shifts
     targets.quads = (pattern(x - SPEED * n / 4) / distance**2 * torch.cos(phase)).float()
     volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), pattern, speed)
-    terms = volume.terms(targets, 30, settings, Draw(0, torch.device("cpu")))
+    terms = terms_of(volume, targets, 30, settings, Draw(0, torch.device("cpu")))
     assert terms.keys() == {"quads", "size", "kinetic", "round_trip", "flow", "quad_mse"}
     assert low <= terms["quad_mse"] < high
     assert terms["kinetic"] == terms["round_trip"] == 0.0
     assert terms["size"].item() == pytest.approx(1e-3 * speed / 3.0, rel=1e-5)
-    first = volume.terms(targets, 1, settings, Draw(0, torch.device("cpu")))
+    first = terms_of(volume, targets, 1, settings, Draw(0, torch.device("cpu")))
     assert first.keys() == {"quads", "quad_mse"}, "the first steps know no flow"
 
 
@@ -268,7 +276,7 @@ def test_optical_flow_pulls_on_the_scene_flow():
     volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), torch.ones_like)
     for error in (0.0, 1.5):
         targets.flow = (forward + error).expand(len(targets.flow), 2, 2, targets.views.pixels)
-        terms = volume.terms(targets, 30, settings, Draw(0, torch.device("cpu")))
+        terms = terms_of(volume, targets, 30, settings, Draw(0, torch.device("cpu")))
         assert terms["flow"].item() == pytest.approx(0.01 * error, abs=1e-5)
 
 
@@ -278,12 +286,12 @@ def test_rates_and_weights_change_as_published(tmp_path):
     settings = toy("torf", images=8, rate_tenth_after=4, quads_fall_at=6)
     targets = Targets(observe(sequence, settings, "cpu"))
     state = begin(settings, targets, 0, torch.device("cpu"))
-    loop = VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None)
+    loop = loop_of(state, targets, settings, tmp_path)
     for _ in range(4):
-        loop.step(state)
+        loop.step()
     assert state.optimiser.param_groups[0]["lr"] == pytest.approx(0.1 * settings.volume.rate)
     for step, weight in ((0, 8.0), (5, 8.0), (6, 0.8)):
-        terms = state.volume.terms(targets, step, settings, state.draw)
+        terms = terms_of(state.volume, targets, step, settings, state.draw)
         assert terms["quads"].item() == pytest.approx(weight * terms["quad_mse"].item())
 
 
@@ -294,11 +302,11 @@ def test_accumulated_steps_make_one_update(tmp_path):
     settings = replace(settings, volume=replace(settings.volume, accumulated=3))
     targets = Targets(observe(sequence, settings, "cpu"))
     state = begin(settings, targets, 0, torch.device("cpu"))
-    loop = VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None)
+    loop = loop_of(state, targets, settings, tmp_path)
     before = state.volume.moving.density_head.weight.clone()
     changed = []
     for _ in range(4):
-        loop.step(state)
+        loop.step()
         changed.append(not torch.equal(before, state.volume.moving.density_head.weight))
     assert changed == [False, False, True, True]
 
@@ -404,9 +412,7 @@ def test_half_precision_is_near_single(name, tmp_path):
         head = "field.trunk_head.weight" if name == "volume" else "moving.density_head.weight"
         watched = state.volume.get_parameter(head)
         before = watched.detach().clone()
-        VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None).step(
-            state
-        )
+        loop_of(state, targets, settings, tmp_path).step()
         moved = watched.detach() - before
         found[products] = float(state.sums["loss"]), moved
     (loss, moved), (half_loss, half_moved) = found.values()
@@ -421,17 +427,92 @@ def test_no_step_uploads_anything(name):
     settings = toy(name)
     state = begin(settings, targets := targets_of(settings), 0, torch.device("cpu"))
     for step in (0, 35):
-        for quartet in targets.observations.sequence.complete_quartets:
-            targets.around(quartet)
-            targets.around(quartet, after_only=True)
-        state.volume.terms(targets, step, settings, state.draw)
+        choice = state.volume.choice(targets, step, settings, state.draw)
+        inputs = Inputs(choice.numbers, torch.device("cpu"))
+        inputs.send(choice.numbers)
+        given = targets, choice.key, inputs.given, settings, state.draw
+        state.volume.terms(*given)
         with Operations() as operations:
-            state.volume.terms(targets, step, settings, state.draw)
+            state.volume.terms(*given)
         assert operations.found["mul"] > 0
         uploads = {"lift_fresh", "arange", "_to_copy"}
         if name == "volume":  # numbers of cells are cast on the device
             uploads.remove("_to_copy")
         assert not operations.found.keys() & uploads
+
+
+def stepped(name, products, replayed, steps=30, device="cpu", **changes):
+    """A state after some steps of both kinds, and its loop."""
+    settings = toy(name, images=steps, accumulated=2, products=products)
+    flowing = replace(settings.volume.scene_flow, simultaneous_share=0.3)
+    settings = replace(settings, volume=replace(settings.volume, scene_flow=flowing), **changes)
+    sequence = reduced(with_colour(recording(frames=16)[0], size=(12, 9)), 16)
+    targets = Targets(observe(sequence, settings, device))
+    state = begin(settings, targets, 0, torch.device(device))
+    step = VolumeStep(state, targets, settings, replayed=replayed)
+    loop = VolumeLoop(step, NOWHERE, Metrics(NOWHERE), lambda: 0.0, None)
+    for _ in range(steps):
+        loop.step()
+    return state
+
+
+@pytest.mark.parametrize("products", Products)
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_graph_replays_is_a_step(name, products, monkeypatch):
+    """Operations and memory of the second step of a key, repeated, are those of any later one; in
+    place of a CUDA graph a recording that runs on a CPU.
+    """
+    recordings = []
+
+    def recorded():
+        recordings.append(Recorded(monkeypatch))
+        return recordings[-1]
+
+    eager, graph = (stepped(name, products, each) for each in (None, recorded))
+    assert sum(one.replays for one in recordings) >= 12
+    assert len(recordings) >= 2
+    before = eager.sums["loss"].item()
+    assert before > 0.0
+    assert eager.counts == graph.counts
+    for key, value in eager.sums.items():
+        assert torch.equal(value, graph.sums[key]), key
+    for key, value in eager.volume.state_dict().items():
+        assert torch.equal(value, graph.volume.state_dict()[key]), key
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("products", Products)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cuda_graph_is_the_eager_step(name, products):
+    """The same random numbers; sums and parameters as far as atomic sums allow."""
+    eager, graph = (
+        stepped(name, products, None, steps=20, device="cuda", graph=graph)
+        for graph in (False, True)
+    )
+    drawn = [state.draw.pixels(64, 1 << 20) for state in (eager, graph)]
+    assert torch.equal(*drawn), "a graph goes on with the random numbers of the step before"
+    assert eager.counts == graph.counts
+    for key, value in eager.sums.items():
+        assert_close(value, graph.sums[key], rtol=2e-3, atol=1e-5, msg=key)
+    for key, value in eager.volume.named_parameters():
+        apart = (value - graph.volume.get_parameter(key)).abs().mean()
+        assert apart <= 0.05 * eager.optimiser.defaults["lr"], key
+
+
+def test_no_autograd_graph_outlives_a_step():
+    """A node that adds up gradients and is kept from an eager step would bring its stream into the
+    capture of another one, which fails.
+    """
+
+    def results():
+        gc.collect()
+        tensors = [one for one in gc.get_objects() if issubclass(type(one), torch.Tensor)]
+        return {id(one) for one in tensors if one.grad_fn is not None}
+
+    before = results()
+    state = stepped("ftorf", Products.HALF, None, steps=12)
+    assert state.images == 12
+    assert not results() - before
 
 
 def test_a_checkpoint_of_a_gpu_goes_on_elsewhere(tmp_path):
@@ -470,3 +551,9 @@ def test_pixels_without_light_have_no_bounds():
 def targets_of(settings):
     """What a volume of the small recording is compared with."""
     return Targets(observe(small(), settings, "cpu"))
+
+
+def loop_of(state, targets, settings, folder):
+    """Training of a state that writes no rows."""
+    step = VolumeStep(state, targets, settings)
+    return VolumeLoop(step, folder, Metrics(folder / "rows"), lambda: 0.0, None)

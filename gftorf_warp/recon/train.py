@@ -33,7 +33,7 @@ from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict
 from .suitable import check_sequence, faithfulness, log_faithfulness
 from .volume import fit
-from .volume.loop import VolumeState
+from .volume.state import VolumeState
 
 LOG = logging.getLogger("gftorf_warp")
 Choice = TypeVar("Choice", bound=enum.StrEnum)

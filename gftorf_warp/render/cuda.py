@@ -113,20 +113,29 @@ class CapturedGraph:
     call, not kept: an object that keeps its graph would otherwise refer to itself.
     """
 
-    def __init__(self, ready: Callable[[], None] | None = None, pool: Any = None):
+    def __init__(
+        self,
+        ready: Callable[[], None] | None = None,
+        pool: Any = None,
+        generators: Sequence[torch.Generator] = (),
+    ):
         """Nothing is captured yet.
 
         Args:
             ready: Called between the capture and the first replay.
             pool: Memory shared with other graphs, see :func:`graph_pool`; None: its own.
+            generators: Those of the device that the function draws from, besides torch's default
+                one: every replay goes on where the last draw ended.
         """
-        self._ready, self._pool = ready, pool
+        self._ready, self._pool, self._generators = ready, pool, generators
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, work: Callable[[], None]) -> None:
         """Replay the graph of ``work``, the same in all calls; the first one captures it."""
         if self._graph is None:
             graph = torch.cuda.CUDAGraph()
+            for generator in self._generators:
+                graph.register_generator_state(generator)
             with capture(graph, pool=self._pool):
                 work()
             self._graph = graph

@@ -76,11 +76,17 @@ def modulated(
 
 
 def phasor(
-    samples: Samples, sensor: Sensor, transmittance: Float[Tensor, "R S"]
+    samples: Samples,
+    sensor: Sensor,
+    transmittance: Float[Tensor, "R S"],
+    slope: Float[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "3 R"]:
-    """(re, im, amplitude) [optimised units]."""
+    """(re, im, amplitude) [optimised units]; ``slope`` is the phase per distance [rad/m], None:
+    that of the sensor.
+    """
     weight = transmittance.square() * samples.strength
-    phase = sensor.phase_slope * samples.distance + sensor.phase_offset
+    phase = (sensor.phase_slope if slope is None else slope) * samples.distance
+    phase = phase + sensor.phase_offset
     waves = torch.cos(phase), torch.sin(phase), torch.ones_like(phase)
     return torch.stack([(weight * wave).sum(dim=-1) for wave in waves])
 

@@ -13,7 +13,9 @@ from .. import checkpoint
 from ..observations import Observations
 from ..record import Metrics
 from ..settings import ReconSettings
-from .loop import VolumeLoop, VolumeState, begin, from_dict
+from .loop import VolumeLoop
+from .state import VolumeState, begin, from_dict
+from .step import VolumeStep
 from .targets import Targets
 
 LOG = logging.getLogger("gftorf_warp")
@@ -57,4 +59,5 @@ def fit(
     verb = "starts at" if stored is None else "goes on at"
     text = "%s %s step %d of %d, %d parameters, rays from %.3g to %.3g m"
     LOG.info(text, out, verb, state.images, settings.schedule.images, count, near, far)
-    return VolumeLoop(targets, settings, out, metrics, clock, progress).run(state)
+    step = VolumeStep(state, targets, settings)
+    return VolumeLoop(step, out, metrics, clock, progress).run()

@@ -14,6 +14,7 @@ quartet i itself.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -23,25 +24,29 @@ from torch import Tensor
 
 from ..settings import Method, ReconSettings
 from . import composite
+from .choice import Choice, Given
 from .composite import Samples
 from .rays import Depths, Rays
-from .targets import Around, Draw, Targets
+from .scene_flow import BACKWARD, FORWARD, Neighbours, neighbours, projected, regularisers
+from .targets import Around, Draw, Targets, picked
 from .volume import Volume
 
-FORWARD, BACKWARD = 0, 1  # rows of a flow
 
+class FtorfKey(NamedTuple):
+    """Which operations a step consists of."""
 
-class Neighbours(NamedTuple):
-    """Where samples go and come from; each is [R, S, 3] in metres."""
-
-    forward: Tensor
-    """From quartet i to the next."""
-    backward: Tensor
-    """From quartet i to the one before."""
-    from_before: Tensor
-    """From quartet i - 1 to quartet i, at the same points; ``forward`` without i - 1."""
-    from_after: Tensor
-    """From quartet i + 1 back to quartet i, at the same points; ``backward`` without i + 1."""
+    flows: bool
+    """Whether anything flows yet; what follows is False until then."""
+    before: int
+    """Raw frames before the start of the quartet that are compared."""
+    after: int
+    """Those after it."""
+    earlier: bool = False
+    """Whether there is a quartet before."""
+    later: bool = False
+    """Whether there is one after it."""
+    optical: bool = False
+    """Whether its optical flow is compared."""
 
 
 class Ftorf(Volume):
@@ -65,45 +70,71 @@ class Ftorf(Volume):
         "falloff of the synthetic scenes, 4 m^2; colour has no weight, as for real scenes",
     )
 
-    def terms(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> dict:
-        """Raw frames around one quartet, its optical flow, and the regularisers of the flow."""
+    def choice(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> Choice:
+        """A quartet, the raw frames around it that are compared, and the weights of the step."""
         options, quartet = self.settings.scene_flow, draw.one_of(self.box.quartets)
+        flows = step >= options.simultaneous_share * settings.schedule.images
+        every = targets.around(quartet, after_only=not flows)
+        around = self.compared(every, draw) if flows else every
+        before, after = len(around.before), len(around.after)
+        numbers: dict[str, Sequence[float]] = {
+            "quartet": [quartet],
+            "view": [self.box.cycle * quartet],
+            "frames": around.frames,
+            "shift": around.shift,
+            "slope": around.slope,
+        }
+        if not flows:
+            return Choice(FtorfKey(flows, before, after), numbers)
+        earlier, later = (other in self.box.quartets for other in (quartet - 1, quartet + 1))
+        ways = [quartet + 1] * later + [quartet - 1] * earlier
+        weight = settings.weights.flow * max(0.0, 1.0 - step / options.vanishes_at)
+        optical = weight > 0 and quartet in targets.flow_rows
+        numbers |= {
+            "before": around.before,
+            "after": around.after,
+            "own": [quartet] + [quartet - 1] * earlier + [quartet + 1] * later,
+            "visited": [quartet] * (before + after) + ways,
+            "larger": [(len(every.frames) - 1) / max(1, before + after)],
+            "flow_row": [targets.flow_rows[quartet] if optical else 0],
+            "flow_weight": [float(weight)],
+        }
+        return Choice(FtorfKey(flows, before, after, earlier, later, optical), numbers)
+
+    def terms(
+        self, targets: Targets, key: FtorfKey, given: Given, settings: ReconSettings, draw: Draw
+    ) -> dict[str, Tensor]:
+        """Raw frames around one quartet, its optical flow, and the regularisers of the flow."""
         pixels = draw.pixels(self.settings.rays, targets.views.pixels)
-        rays = targets.views.rays(self.box.cycle * quartet, pixels)
+        rays = targets.views.rays(given["view"], pixels)
         depths, weight = self.depths(rays, draw), settings.weights.quads
         points = rays.at(depths.z)
-        if step < options.simultaneous_share * settings.schedule.images:
+        if not key.flows:
             with self.precision():
-                trunk = self.trunk(points[None], [quartet])
+                trunk = self.trunk(points[None], given["quartet"])
                 samples = self.samples(trunk, rays, depths, draw=draw)
-            around = targets.around(quartet, after_only=True)
-            mse = _errors(targets, around, samples, pixels).mean()
-            more = self.more_terms(rays, depths, samples, step, settings)
+            mse = _errors(targets, given, samples, pixels).mean()
+            more = self.more_terms(rays, depths, samples, settings)
             return {"quads": weight * mse, "quad_mse": mse.detach()} | more
-        every = targets.around(quartet)
-        around = self.compared(every, draw)
         with self.precision():
-            own, flows = self._quartet(quartet, points)
-            beside, gap = self._beside(around, quartet, points, flows)
+            # the flows of its neighbours are of the same products
+            rows = points.expand(len(given["own"]), *points.shape)
+            own, flow = self.values_and_flow(rows, given["own"], slice(1), slice(None))
+            flows = neighbours(flow, earlier=key.earlier, later=key.later)
+            beside, gap = self._beside(key, given, points, flows)
             samples = self.samples(torch.cat([own, beside]), rays, depths, draw=draw)
-        errors = _errors(targets, around, samples, pixels)
-        larger = (len(every.frames) - 1) / max(1, len(around.frames) - 1)
-        kept = max(1, round(options.kinetic_share * depths.z.shape[1]))
-        both = (flows.forward + flows.backward)[:, :kept]
+        errors = _errors(targets, given, samples, pixels)
         terms = {
-            "quads": weight * (errors[0] + larger * errors[1:].sum()),
-            "size": options.size * 0.5 * (flows.forward.abs() + flows.backward.abs()).mean(),
-            "kinetic": options.kinetic * 0.5 * both.square().sum(dim=-1).mean(),
-            "round_trip": options.round_trip * gap,
+            "quads": weight * (errors[0] + given["larger"][0] * errors[1:].sum()),
+            **regularisers(flows, gap, self.settings.scene_flow),
             "quad_mse": errors.mean().detach(),
         }
-        weight = settings.weights.flow * max(0.0, 1.0 - step / options.vanishes_at)
-        if weight > 0 and quartet in targets.flow_rows:
-            measured = targets.flow[targets.flow_rows[quartet]][..., pixels]
-            nearest = 0.5 * self.box.bounds[0]
-            seen = rays.at((_weights(samples)[0] * depths.z).sum(dim=-1))
-            terms["flow"] = weight * _projected(targets, measured, samples, seen, flows, nearest)
-        return terms | self.more_terms(rays, depths, samples, step, settings)
+        if key.optical:
+            measured = picked(targets.flow, given["flow_row"], pixels)
+            weights, near = (samples.alpha * samples.transmittance)[0], self.box.bounds[0]
+            apart = projected(targets.camera, measured, weights, rays, depths, flows, near)
+            terms["flow"] = given["flow_weight"][0] * apart
+        return terms | self.more_terms(rays, depths, samples, settings)
 
     def compared(self, around: Around, draw: Draw) -> Around:  # noqa: ARG002
         """Which of the raw frames around a quartet start a step compares: all."""
@@ -114,7 +145,6 @@ class Ftorf(Volume):
         rays: Rays,  # noqa: ARG002
         depths: Depths,  # noqa: ARG002
         samples: Samples,  # noqa: ARG002
-        step: int,  # noqa: ARG002
         settings: ReconSettings,  # noqa: ARG002
     ) -> dict[str, Tensor]:
         """Weighted terms of the loss that were not published: none."""
@@ -123,7 +153,7 @@ class Ftorf(Volume):
     def values_and_flow(
         self,
         points: Float[Tensor, "T R S 3"],
-        quartets: list[int],
+        quartets: Int[Tensor, "T"],
         seen: slice,
         flowing: slice,
     ) -> tuple[Float[Tensor, "t R S w"], Float[Tensor, "u R S 2 3"]]:
@@ -131,44 +161,23 @@ class Ftorf(Volume):
         trunk = self.trunk(points, quartets)
         return trunk[seen], self.moving.flow(trunk[flowing], self.box.reach)
 
-    def _quartet(
-        self, quartet: int, points: Float[Tensor, "R S 3"]
-    ) -> tuple[Float[Tensor, "1 R S w"], Neighbours]:
-        """Values and flows at a quartet; the flows of its neighbours are of the same products."""
-        before, after = quartet - 1 in self.box.quartets, quartet + 1 in self.box.quartets
-        quartets = [quartet] + [quartet - 1] * before + [quartet + 1] * after
-        rows = points.expand(len(quartets), *points.shape)
-        own, flow = self.values_and_flow(rows, quartets, slice(1), slice(None))
-        forward, backward = flow[0, ..., FORWARD, :], flow[0, ..., BACKWARD, :]
-        flows = Neighbours(
-            forward=forward,
-            backward=backward,
-            from_before=flow[1, ..., FORWARD, :] if before else forward,
-            from_after=flow[-1, ..., BACKWARD, :] if after else backward,
-        )
-        return own, flows
-
     def _beside(
-        self, around: Around, quartet: int, points: Float[Tensor, "R S 3"], flows: Neighbours
+        self, key: FtorfKey, given: Given, points: Float[Tensor, "R S 3"], flows: Neighbours
     ) -> tuple[Float[Tensor, "b R S w"], Tensor]:
         """Values of the points where the raw frames beside the start of a quartet see them, and the
         mean gap after a flow and the flow back [m].
         """
-        before, after = (share[:, None, None, None] for share in (around.before, around.after))
-        ways = {
-            other: flow
-            for other, flow in ((quartet + 1, flows.forward), (quartet - 1, flows.backward))
-            if other in self.box.quartets
-        }
+        before, after = (given[name][:, None, None, None] for name in ("before", "after"))
         moved = [points + before * flows.from_before, points + after * flows.from_after]
-        moved += [(points + flow)[None] for flow in ways.values()]
-        count = len(before) + len(after)
+        ways = [(flows.forward, BACKWARD)] * key.later + [(flows.backward, FORWARD)] * key.earlier
+        moved += [(points + flow)[None] for flow, _ in ways]
+        count = key.before + key.after
         beside, back = self.values_and_flow(
-            torch.cat(moved), [quartet] * count + [*ways], slice(count), slice(count, None)
+            torch.cat(moved), given["visited"], slice(count), slice(count, None)
         )
         gaps = [
-            (flow + found[..., BACKWARD if other > quartet else FORWARD, :]).abs().mean()
-            for (other, flow), found in zip(ways.items(), back, strict=True)
+            (flow + found[..., returns, :]).abs().mean()
+            for (flow, returns), found in zip(ways, back, strict=True)
         ]
         return beside, torch.stack(gaps).sum() if gaps else points.new_zeros(())
 
@@ -185,49 +194,20 @@ class Ftorf(Volume):
                 beside = quartet + (1 if share > 0 else -1)
                 source = beside if beside in self.box.quartets else quartet
                 nothing, all_rows = slice(0), slice(None)
-                _, flow = self.values_and_flow(points[None], [source], nothing, all_rows)
+                _, flow = self.values_and_flow(
+                    points[None], self.quartet(source), nothing, all_rows
+                )
                 points = points + abs(share) * flow[0, ..., BACKWARD if share > 0 else FORWARD, :]
-            return self.samples(self.trunk(points[None], [quartet])[0], rays, depths)
+            return self.samples(self.trunk(points[None], self.quartet(quartet))[0], rays, depths)
 
 
 def _errors(
-    targets: Targets, around: Around, samples: Samples, pixels: Int[Tensor, "R"]
+    targets: Targets, given: Given, samples: Samples, pixels: Int[Tensor, "R"]
 ) -> Float[Tensor, "B"]:
     """Mean squared error of the slot that each raw frame measured [optimised units^2]."""
     sensor = targets.observations.sensor
     passed = samples.transmittance
-    found = composite.modulated(samples, sensor, passed, around.shift, around.slope)
-    measured = targets.quads[around.frames][:, pixels]
+    shift, slope = (given[name][:, None, None] for name in ("shift", "slope"))
+    found = composite.modulated(samples, sensor, passed, shift, slope)
+    measured = targets.quads[given["frames"][:, None], pixels]
     return (found - measured).square().mean(dim=1)
-
-
-def _projected(
-    targets: Targets,
-    measured: Float[Tensor, "2 2 R"],
-    samples: Samples,
-    seen: Float[Tensor, "R 3"],
-    flows: Neighbours,
-    nearest: float,
-) -> Tensor:
-    """Mean absolute difference to the optical flow of a quartet start [px], where known; the
-    first of the samples are those of the start, and nothing is nearer than ``nearest`` [m].
-    """
-    weight = _weights(samples)[0]
-    start, known = _image(targets, seen, nearest), measured.isfinite()
-    gaps = []
-    for direction, flow in ((FORWARD, flows.forward), (BACKWARD, flows.backward)):
-        moved = seen + (weight[..., None] * flow).sum(dim=1)
-        apart = (_image(targets, moved, nearest) - start).T - measured[direction]
-        gaps.append(torch.where(known[direction], apart, torch.zeros_like(apart)).abs().sum())
-    return torch.stack(gaps).sum() / known.sum().clamp_min(1)
-
-
-def _weights(samples: Samples) -> Float[Tensor, "*b R S"]:
-    """Weights alpha T of samples [1]."""
-    return samples.alpha * samples.transmittance
-
-
-def _image(targets: Targets, points: Float[Tensor, "R 3"], nearest: float) -> Float[Tensor, "R 2"]:
-    """Positions in the images of the camera at rest [px], of points at least so far away [m]."""
-    depth = points[:, 2:].clamp_min(nearest)
-    return targets.camera.project(torch.cat([points[:, :2], depth], dim=1))

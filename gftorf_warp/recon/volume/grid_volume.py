@@ -46,8 +46,6 @@ class GridVolume(Ftorf):
         "or F-TöRF",
         "a step compares some of the raw frames beside a quartet start, at random",
     )
-    numbers: Int[Tensor, "Q"]
-    """Numbers of the quartets, on the device."""
     scale: Float[Tensor, "2"]
     """Unit cube per x / z and y / z [1]."""
 
@@ -57,9 +55,7 @@ class GridVolume(Ftorf):
         octaves = self.settings.network.direction_octaves
         self.field = GridNetwork(self.grid, quartets, octaves, generator)
         self.occupancy = Occupancy(self.grid.occupancy)
-        # uploads in every step would make a GPU wait
-        numbers = torch.arange(quartets, dtype=torch.int32)
-        self.register_buffer("numbers", numbers, persistent=False)
+        # an upload in every step would make a GPU wait
         scale = 0.5 / (MARGIN * torch.tensor(self.box.spread).clamp_min(1e-6))
         self.register_buffer("scale", scale, persistent=False)
 
@@ -92,28 +88,24 @@ class GridVolume(Ftorf):
         return around.some(self.grid.beside, draw)
 
     def trunk(
-        self, points: Float[Tensor, "T R S 3"], quartets: list[int]
+        self, points: Float[Tensor, "T R S 3"], quartets: Int[Tensor, "T"]
     ) -> Float[Tensor, "T R S v"]:
         """Values of points [m], each row at its quartet."""
         unit, shape = self.unit(points).flatten(1, 2), points.shape[1:3]
-        return self.field.trunk(unit, self._times(quartets)).unflatten(1, shape)
+        return self.field.trunk(unit, quartets).unflatten(1, shape)
 
     def values_and_flow(
         self,
         points: Float[Tensor, "T R S 3"],
-        quartets: list[int],
+        quartets: Int[Tensor, "T"],
         seen: slice,
         flowing: slice,
     ) -> tuple[Float[Tensor, "t R S v"], Float[Tensor, "u R S 2 3"]]:
         """Values of some rows and scene flow [m] of some, each of grids of their own."""
         unit, shape = self.unit(points).flatten(1, 2), points.shape[1:3]
-        times = self._times(quartets)
-        values = self.field.trunk(unit[seen], times[seen])
-        flow = self.field.flow(unit[flowing], times[flowing], self.box.reach)
+        values = self.field.trunk(unit[seen], quartets[seen])
+        flow = self.field.flow(unit[flowing], quartets[flowing], self.box.reach)
         return values.unflatten(1, shape), flow.unflatten(1, shape)
-
-    def _times(self, quartets: list[int]) -> Int[Tensor, "T"]:
-        return torch.stack([self.numbers[i] for i in quartets])  # a list would be uploaded
 
     def samples(
         self,
@@ -134,15 +126,18 @@ class GridVolume(Ftorf):
         rays: Rays,
         depths: Depths,
         samples: Samples,
-        step: int,
         settings: ReconSettings,
     ) -> dict[str, Tensor]:
         """What changes from quartet to quartet, and the distortion of rays; notes what is seen."""
         passed = samples.transmittance
         weight = (samples.alpha * passed).detach()
-        self.occupancy.note(self.unit(rays.at(depths.z)), weight, step)
+        self.occupancy.note(self.unit(rays.at(depths.z)), weight)
         terms = {"at_rest": self.grid.at_rest * self.field.moving.table.square().mean()}
         if settings.weights.distortion > 0:
             spread = composite.distortion(samples, passed).mean()
             terms["distortion"] = settings.weights.distortion * spread
         return terms
+
+    def after(self, step: int) -> None:
+        """Update where samples are."""
+        self.occupancy.update(step)

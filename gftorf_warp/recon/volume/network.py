@@ -17,7 +17,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -176,7 +176,7 @@ class TimeCodes(torch.nn.Module):
         """Values C of a code."""
         return self.values.shape[1]
 
-    def forward(self, quartets: list[int]) -> Float[Tensor, "T C"]:
+    def forward(self, quartets: Int[Tensor, "T"]) -> Float[Tensor, "T C"]:
         """Codes of some quartets."""
-        codes = torch.stack([self.values[i] for i in quartets])  # a list would be uploaded
+        codes = self.values.index_select(0, quartets)
         return functional.normalize(codes, dim=-1) if self.learnt else codes

@@ -39,13 +39,15 @@ class Occupancy(torch.nn.Module):
         self.register_buffer("occupied", torch.ones(shape))
 
     @torch.no_grad()
-    def note(
-        self, points: Float[Tensor, "R S 3"], weight: Float[Tensor, "B R S"], step: int
-    ) -> None:
+    def note(self, points: Float[Tensor, "R S 3"], weight: Float[Tensor, "B R S"]) -> None:
         """Note weights alpha T [1] of samples at points in the unit cube, of several raw frames."""
         cells = self._cells(points).flatten()
         largest = weight.amax(dim=0).flatten()
         self.seen.view(-1).scatter_reduce_(0, cells, largest, "amax")
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Decide anew what is occupied, if that is due after a step, and forget a little."""
         if (step + 1) % self.settings.update_every == 0:
             if step >= self.settings.warm_up:
                 spread = functional.max_pool3d(self.seen[None], 3, stride=1, padding=1)[0]

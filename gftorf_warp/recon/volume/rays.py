@@ -92,9 +92,12 @@ class Views:
         x, y = torch.stack(found).amax(0).tolist()
         return x, y
 
-    def rays(self, view: int, pixels: Int[Tensor, "R"] | None = None) -> Rays:
-        """The rays of some pixels, numbered row by row, or of all."""
-        pose = self._volume_from_camera[view]
+    def rays(self, view: Int[Tensor, "1"] | int, pixels: Int[Tensor, "R"] | None = None) -> Rays:
+        """The rays of some pixels, numbered row by row, or of all; a view whose number is on the
+        device is one that CUDA graphs may change.
+        """
+        poses = self._volume_from_camera
+        pose = poses[view] if isinstance(view, int) else poses.index_select(0, view)[0]
         local = self._local if pixels is None else self._local[pixels]
         direction = local @ pose[:3, :3].T
         return Rays(origin=pose[:3, 3].expand_as(direction), direction=direction)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -20,19 +20,19 @@ OUTLIERS = 0.005  # share of decoded distances at either end that does not count
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Around:
-    """B measured raw frames less than a cycle from the start of a quartet, on the device."""
+    """B measured raw frames less than a cycle from the start of a quartet."""
 
-    frames: Int[Tensor, "B"]
+    frames: tuple[int, ...]
     """Their numbers: the start, then those before it, then those after it."""
-    before: Float[Tensor, "b"]
+    before: tuple[float, ...]
     """Cycles from the b before it to the start [1]."""
-    after: Float[Tensor, "a"]
+    after: tuple[float, ...]
     """Cycles from the start to the a after it [1]."""
-    shift: Float[Tensor, "B 1 1"]
+    shift: tuple[float, ...]
     """Their phase shifts [rad]."""
-    slope: Float[Tensor, "B 1 1"]
+    slope: tuple[float, ...]
     """Their phases per distance [rad/m]."""
 
     def some(self, count: int | None, draw: Draw) -> Around:
@@ -44,9 +44,9 @@ class Around:
             return self
         before, after = draw.part_of(b, count), draw.part_of(a, count)
 
-        def rows(values: Tensor) -> Tensor:
+        def rows(values: tuple[T, ...]) -> tuple[T, ...]:
             ahead, behind = values[1 : 1 + b], values[1 + b :]
-            return torch.cat([values[:1], ahead[before], behind[after]])
+            return values[:1] + ahead[before] + behind[after]
 
         return Around(
             frames=rows(self.frames),
@@ -65,14 +65,15 @@ class Targets:
         sequence, device = observations.sequence, observations.quads.device
         self.observations, self.cycle = observations, sequence.cycle
         self._around: dict[tuple[int, bool], Around] = {}
-        self.measured: list[bool] = sequence.measured.tolist()
-        """Whether each raw frame was."""
         self.quads: Float[Tensor, "F P"] = observations.quads.flatten(1)
         """Raw frames."""
         self.phasors: Float[Tensor, "r 2 P"] = _by_pixel(observations.phasors)
         """Phasors, in the order of ``phasor_frames``; empty if quads are compared."""
         self.phasor_frames = list(observations.phasors.rows)
         """The raw frame that represents each phasor."""
+        sensors = [observations.sensor_at(n) for n in self.phasor_frames]
+        self.phasor_slopes = [float(sensor.phase_slope) for sensor in sensors]
+        """Their phases per distance [rad/m]."""
         self.flow: Float[Tensor, "r 2 2 P"] = _by_pixel(observations.flow)
         """Optical flow [px] in the order of ``flow_quartets``, forward and backward; NaN:
         unknown."""
@@ -101,26 +102,19 @@ class Targets:
         if (quartet, after_only) not in self._around:
             start, cycle = self.cycle * quartet, self.cycle
             first = start if after_only else max(0, start - cycle + 1)
-            measured = [
-                n for n in range(first, min(start + cycle, len(self.measured))) if self.measured[n]
-            ]
+            known = self.observations.sequence.measured
+            measured = [n for n in range(first, min(start + cycle, len(known))) if known[n]]
             before, after = [n for n in measured if n < start], [n for n in measured if n > start]
-            self._around[quartet, after_only] = self._on_device(start, before, after)
+            frames = (start, *before, *after)
+            sensors = [self.observations.sensor_at(n) for n in frames]
+            self._around[quartet, after_only] = Around(
+                frames=frames,
+                before=tuple((start - n) / cycle for n in before),
+                after=tuple((n - start) / cycle for n in after),
+                shift=tuple(sensor.shifts[0] for sensor in sensors),
+                slope=tuple(float(sensor.phase_slope) for sensor in sensors),
+            )
         return self._around[quartet, after_only]
-
-    def _on_device(self, start: int, before: list[int], after: list[int]) -> Around:
-        sensors = [self.observations.sensor_at(n) for n in (start, *before, *after)]
-
-        def column(values: Iterable[float]) -> Tensor:
-            return self.quads.new_tensor([*values])
-
-        return Around(
-            frames=torch.tensor([start, *before, *after], device=self.quads.device),
-            before=column((start - n) / self.cycle for n in before),
-            after=column((n - start) / self.cycle for n in after),
-            shift=column(sensor.shifts[0] for sensor in sensors)[:, None, None],
-            slope=column(float(sensor.phase_slope) for sensor in sensors)[:, None, None],
-        )
 
     @property
     def quartet_times(self) -> list[float]:
@@ -140,6 +134,13 @@ class Targets:
         z = z[:: max(1, len(z) // 1_000_000)]  # as many as a quantile takes
         near, far = torch.quantile(z, torch.tensor([OUTLIERS, 1.0 - OUTLIERS])).tolist()
         return NEARER * near, FARTHER * far
+
+
+def picked(
+    images: Float[Tensor, "r *c P"], row: Int[Tensor, "1"], pixels: Int[Tensor, "R"]
+) -> Float[Tensor, "*c R"]:
+    """Some pixels of one of several images, whose number is on the device."""
+    return images.index_select(0, row)[0][..., pixels]
 
 
 def _by_pixel(stack: ImageStack) -> Float[Tensor, "r *c P"] | Float[Tensor, "0"]:

@@ -11,17 +11,20 @@ A quartet counts as simultaneous, so what moves within one is at a wrong distanc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from ..settings import Method, ReconSettings
 from . import composite
+from .choice import Choice, Given
 from .composite import Samples
 from .rays import Depths, Rays
-from .targets import Draw, Targets
+from .targets import Draw, Targets, picked
 from .volume import Volume
 
 FALLEN = 0.1  # [1] weight of the phasors from ``quads_fall_at`` on
@@ -44,41 +47,55 @@ class Torf(Volume):
         "the fifth output of the light, a bias of the phase that was never used, is left out",
     )
 
-    def terms(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> dict:
-        """Phasors and colour in turn, if there is colour."""
+    def choice(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> Choice:
+        """A phasor or a colour image in turn, if there is colour."""
         if targets.colour is not None and settings.weights.colour > 0 and step % 2:
-            return {"colour": settings.weights.colour * self._colour(targets, draw)}
-        fallen = self.settings.quads_fall_at
-        weight = settings.weights.quads
-        if fallen is not None and step >= fallen:
-            weight *= FALLEN
-        mse = self._phasor(targets, draw)
-        return {"quads": weight * mse, "quad_mse": mse.detach()}
-
-    def _phasor(self, targets: Targets, draw: Draw) -> Tensor:
-        """Mean squared error of (re, im) [optimised units^2]."""
+            row = draw.one_of(range(len(targets.colour_frames)))
+            quartet = targets.colour_frames[row] // targets.cycle
+            return Choice("colour", {"row": [row], "view": [row], "quartet": [quartet]})
         row = draw.one_of(range(len(targets.phasor_frames)))
-        frame = targets.phasor_frames[row]
-        pixels = draw.pixels(self.settings.rays, targets.views.pixels)
-        rays = targets.views.rays(frame, pixels)
-        samples = self._drawn(rays, frame // targets.cycle, draw)
-        sensor = targets.observations.sensor_at(frame)
-        found = composite.phasor(samples, sensor, samples.transmittance)[:2]
-        return torch.mean((found - targets.phasors[row][:, pixels]).square())
+        frame, fallen = targets.phasor_frames[row], self.settings.quads_fall_at
+        falls = fallen is not None and step >= fallen
+        numbers: dict[str, Sequence[float]] = {
+            "row": [row],
+            "view": [frame],
+            "quartet": [frame // targets.cycle],
+            "slope": [targets.phasor_slopes[row]],
+            "weight": [settings.weights.quads * (FALLEN if falls else 1.0)],
+        }
+        return Choice("phasor", numbers)
 
-    def _colour(self, targets: Targets, draw: Draw) -> Tensor:
+    def terms(
+        self, targets: Targets, key: str, given: Given, settings: ReconSettings, draw: Draw
+    ) -> dict[str, Tensor]:
+        """The error of a phasor or of a colour image."""
+        if key == "colour":
+            return {"colour": settings.weights.colour * self._colour(targets, given, draw)}
+        mse = self._phasor(targets, given, draw)
+        return {"quads": given["weight"][0] * mse, "quad_mse": mse.detach()}
+
+    def _phasor(self, targets: Targets, given: Given, draw: Draw) -> Tensor:
+        """Mean squared error of (re, im) [optimised units^2]."""
+        pixels = draw.pixels(self.settings.rays, targets.views.pixels)
+        rays = targets.views.rays(given["view"], pixels)
+        samples = self._drawn(rays, given["quartet"], draw)
+        sensor, passed = targets.observations.sensor, samples.transmittance
+        found = composite.phasor(samples, sensor, passed, given["slope"])[:2]
+        return torch.mean((found - picked(targets.phasors, given["row"], pixels)).square())
+
+    def _colour(self, targets: Targets, given: Given, draw: Draw) -> Tensor:
         """Mean squared error of the colour [1]."""
         assert targets.colour is not None
         assert targets.colour_views is not None
-        row = draw.one_of(range(len(targets.colour_frames)))
         pixels = draw.pixels(self.settings.rays, targets.colour_views.pixels)
-        rays = targets.colour_views.rays(row, pixels)
-        quartet = targets.colour_frames[row] // targets.cycle
-        samples = self._drawn(rays, quartet, draw, colour=True)
+        rays = targets.colour_views.rays(given["view"], pixels)
+        samples = self._drawn(rays, given["quartet"], draw, colour=True)
         found = composite.colour(samples, samples.transmittance)
-        return torch.mean((found - targets.colour[row][:, pixels]).square())
+        return torch.mean((found - picked(targets.colour, given["row"], pixels)).square())
 
-    def _drawn(self, rays: Rays, quartet: int, draw: Draw, *, colour: bool = False) -> Samples:
+    def _drawn(
+        self, rays: Rays, quartet: Int[Tensor, "1"], draw: Draw, *, colour: bool = False
+    ) -> Samples:
         """Samples at random z-depths of their cells, with noise on their densities."""
         return self._blended(rays, self.depths(rays, draw), quartet, draw, colour=colour)
 
@@ -86,7 +103,7 @@ class Torf(Volume):
         self,
         rays: Rays,
         depths: Depths,
-        quartet: int,
+        quartet: Int[Tensor, "1"],
         draw: Draw | None,
         *,
         colour: bool,
@@ -95,7 +112,7 @@ class Torf(Volume):
         assert self.resting is not None, "settings of method torf have network.static"
         points = rays.at(depths.z)
         with self.precision():
-            trunk = self.trunk(points[None], [quartet])[0]
+            trunk = self.trunk(points[None], quartet)[0]
             share = self.moving.blend(trunk)
             moving = self.samples(trunk, rays, depths, draw=draw, colour=colour)
             trunk = self.resting.trunk(self.unit(points), None)
@@ -120,5 +137,5 @@ class Torf(Volume):
         """Samples of the quartet whose middle is nearest to a time [s]."""
         half = 0.5 * self.box.period * (1.0 - 1.0 / self.box.cycle)
         middles = np.array(self.box.quartet_times)[self.box.quartets] + half
-        quartet = self.box.quartets[int(np.abs(middles - time).argmin())]
+        quartet = self.quartet(self.box.quartets[int(np.abs(middles - time).argmin())])
         return self._blended(rays, depths, quartet, None, colour=self.box.colour)

@@ -8,12 +8,13 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...scene.motion import Products
 from ..settings import Method, ReconSettings
 from . import composite
+from .choice import Choice, Given
 from .composite import Samples
 from .network import Light, TimeCodes, VolumeNetwork
 from .rays import Depths, Rays, evenly
@@ -69,6 +70,8 @@ class Volume(torch.nn.Module, abc.ABC):
     """What was not published, or is done in another way, in sentences."""
     axis_scale: Float[Tensor, "3"]
     """``SCALED`` on the device."""
+    numbers: Int[Tensor, "Q"]
+    """Numbers of the quartets on the device, int32."""
 
     def __init__(self, settings: VolumeSettings, box: Box, generator: torch.Generator):
         """Create random networks.
@@ -90,6 +93,8 @@ class Volume(torch.nn.Module, abc.ABC):
         self.settings, self.box = settings, box
         # an upload in every step would make a GPU wait
         self.register_buffer("axis_scale", torch.tensor(SCALED), persistent=False)
+        numbers = torch.arange(len(box.quartet_times), dtype=torch.int32)
+        self.register_buffer("numbers", numbers, persistent=False)
         self.build(generator)
 
     def build(self, generator: torch.Generator) -> None:
@@ -100,8 +105,32 @@ class Volume(torch.nn.Module, abc.ABC):
         self.resting = VolumeNetwork(network, 0, generator) if network.static else None
 
     @abc.abstractmethod
-    def terms(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> dict:
-        """Weighted terms of the loss of one step, and ``quad_mse``, the unweighted one."""
+    def choice(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> Choice:
+        """What one step works on, decided on the host."""
+
+    @abc.abstractmethod
+    def terms(
+        self, targets: Targets, key: Any, given: Given, settings: ReconSettings, draw: Draw
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the loss of one step, and ``quad_mse``, the unweighted one.
+
+        Captured as a CUDA graph: the key decides about operations, whatever else differs between
+        steps is on the device.
+
+        Args:
+            targets: What is compared.
+            key: Of a :meth:`choice`.
+            given: Its numbers.
+            settings: Of the run.
+            draw: Random numbers, of which only those on the device may be drawn here.
+        """
+
+    def after(self, step: int) -> None:
+        """What is due after a step besides gradients: nothing."""
+
+    def quartet(self, number: int) -> Int[Tensor, "1"]:
+        """The number of a quartet on the device."""
+        return self.numbers[number : number + 1]
 
     @abc.abstractmethod
     def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
@@ -128,7 +157,7 @@ class Volume(torch.nn.Module, abc.ABC):
         return evenly(self.box.bounds, len(rays.origin), count, rays.origin.device, random)
 
     def trunk(
-        self, points: Float[Tensor, "T R S 3"], quartets: list[int]
+        self, points: Float[Tensor, "T R S 3"], quartets: Int[Tensor, "T"]
     ) -> Float[Tensor, "T R S w"]:
         """Values of the moving network at points [m], each row at the time of its quartet."""
         flat = self.unit(points).flatten(1, 2)
