@@ -332,13 +332,14 @@ def _sweep(options: argparse.Namespace) -> int:
 
     plan = read_plan(options.plan)
     if options.dry_run:
-        print("\n".join(job.id for job in (*plan.recordings, *plan.fits)))
+        some = plan if options.rows is None else plan.only(options.rows)
+        print("\n".join(job.id for job in (*some.recordings, *some.fits)))
         return 0
     device = start(options)
     from .sweep.command import TABLE, sweep
     from .sweep.table import exit_code
 
-    given = _named(options, "out", "workers", "scheduler")
+    given = _named(options, "out", "rows", "workers", "scheduler")
     devices = _gpus() if device != "cpu" and ":" not in options.device else [device]
     results = sweep(plan, **given, devices=devices, progress=_progress(options)("sweep"))
     print((Path(options.out) / TABLE).read_text(encoding="utf-8"), end="")

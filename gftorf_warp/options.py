@@ -293,6 +293,7 @@ def command_parsers() -> dict[str, Parser]:
     plans = "TOML file: scenes, presets, seeds, settings, see docs/sweep.md"
     sweep.add_argument("plan", metavar="FILE", help=plans)
     sweep.option("--out", "DIR", str, "folder of runs and tables (gftorf-sweep)", "gftorf-sweep")
+    sweep.option("--rows", "NAME,NAME", _list_of(str), "rows to do now; the table has all (all)")
     kinds = "auto (default), cpu, cuda for all GPUs; cuda:1 is the second one"
     sweep.option("--device", "auto|cpu|cuda", _device, kinds, "auto")
     processes = "processes (one per GPU, or per two CPUs)"

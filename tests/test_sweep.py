@@ -16,7 +16,7 @@ from moving_box import recording
 from gftorf_warp.cli import main
 from gftorf_warp.data.lock import locked
 from gftorf_warp.data.write import write
-from gftorf_warp.errors import InputError, ResourceError
+from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.evaluate import pictures
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
@@ -206,6 +206,13 @@ WRONG = {
     'scenes = ["demo"]\npresets = ["best"]\n[changes]\n"../x" = ["b=1"]': "letters",
     'scenes = ["demo"]\npresets = ["best"]\n[published]\nx = 3': "expected a table",
     'scenes = ["demo"]\npresets = ["best"]\n[published]\nx = {demo = "3"}': "error of d",
+    'scenes = ["demo"]\nrows = {a = 3}': "table with a preset",
+    'scenes = ["demo"]\nrows = {"a b" = {preset = "best"}}': "letters",
+    'scenes = ["demo"]\nrows = {a = {preset = "bets"}}': "did you mean best",
+    'scenes = ["demo"]\nrows = {a = {preset = "best", inputs = "quads"}}': "did you mean input",
+    'scenes = ["demo"]\nrows = {a = {preset = "best", images = 0}}': "from 1 on",
+    'scenes = ["demo"]\npresets = ["best"]\nrows = {best = {preset = "fast"}}': "this name",
+    'scenes = ["demo"]\npresets = ["best"]\none_seed = ["bst"]': "did you mean best",
     "scenes = [": "Invalid",
 }
 
@@ -308,3 +315,45 @@ def test_the_memory_of_a_job_is_not_that_of_the_one_before(monkeypatch):
     assert forgotten == []
     forget_peak_memory("cuda:1")
     assert forgotten == ["cuda:1"]
+
+
+def test_rows_are_described_one_by_one(tmp_path):
+    """With input, row of the ablation table and length of their own, also without presets."""
+    text = 'scenes = ["demo"]\nseeds = [0, 1]\nimages = 8\none_seed = ["bright"]\n'
+    text += '[rows.phasors]\npreset = "released"\ninput = "phasor"\n'
+    text += '[rows.bright]\npreset = "paper"\nablation = "h1"\nimages = 4\n'
+    (tmp_path / "plan.toml").write_text(text)
+    plan = read_plan(tmp_path / "plan.toml")
+    assert [job.id for job in plan.fits] == [
+        f"demo/{name}" for name in ("phasors-0", "bright-0", "phasors-1")
+    ]
+    given = [row.arguments(plan.images) for row in plan.rows]
+    assert [(g["input"], g["ablation"], g["images"]) for g in given] == [
+        ("phasor", None, 8),
+        ("auto", "h1", 4),
+    ]
+    assert [row.name for row in plan.only(["bright"]).rows] == ["bright"]
+    with pytest.raises(UsageError, match="did you mean bright"):
+        plan.only(["brigt"])
+
+
+def test_what_a_method_cannot_do_is_said_in_its_row(tmp_path):
+    """A camera that moves, no colour: no error, and the rows that were not asked for stay."""
+    sequence, images = recording(frames=8)
+    write("ftorf", tmp_path / "box", sequence, images)
+    plan = Plan(
+        scenes=(Scene(name="box", sequence=tmp_path / "box"),),
+        rows=(Row(preset="ctof"), Row(preset="dgs", title="from-colour")),
+        images=4,
+    )
+    first = sweep(plan, tmp_path / "out", rows=["ctof"], workers=1)
+    assert [*first] == ["box/ctof-0"]
+    results = sweep(plan, tmp_path / "out", rows=["from-colour"], workers=1)
+    assert [*results] == ["box/ctof-0", "box/from-colour-0"]
+    assert results["box/from-colour-0"]["refused"] == "no colour"
+    assert table.exit_code(results.values()) == 0
+    text = (tmp_path / "out" / "sweep.md").read_text()
+    assert "| box | from-colour | not applied: no colour | - |" in text
+    assert "not applied: box, from-colour: no colour: preset dgs compares colour alone" in text
+    assert f"| box | ctof | {first['box/ctof-0']['metrics']['d_mse_x100']:.3g} |" in text
+    assert "What cannot be applied" in (tmp_path / "out" / "sweep.html").read_text()

@@ -29,6 +29,7 @@ def sweep(
     plan: Plan | str | Path,
     out: str | Path,
     *,
+    rows: Sequence[str] | None = None,
     devices: Sequence[str] = ("cpu",),
     workers: int | None = None,
     scheduler: str | None = None,
@@ -44,6 +45,8 @@ def sweep(
     Args:
         plan: What to do, or its TOML file.
         out: Folder to write.
+        rows: Names of the rows to do now; None: all. The tables have all rows, the others as they
+            are stored.
         devices: GPUs of this machine, or its CPU; of a cluster, what its workers have.
         workers: Number of processes here; None: one per GPU, or one per two CPUs.
         scheduler: Address of a Dask scheduler whose workers do the jobs; None: this machine.
@@ -54,7 +57,7 @@ def sweep(
 
     Raises:
         InputError: If the TOML file is no plan.
-        UsageError: If the number of processes makes no sense.
+        UsageError: If the number of processes makes no sense, or there is no row of a name.
         ResourceError: If no scheduler answers.
         BusyError: If another sweep works in ``out``.
     """
@@ -63,12 +66,13 @@ def sweep(
         raise UsageError("no workers", where="--workers", why=why, fix="leave it out")
     if not isinstance(plan, Plan):
         plan = read_plan(plan)
+    now = plan if rows is None else plan.only(rows)
     out = Path(out).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    with locked(out, ".sweep.lock", "sweep"), _doers(plan, devices, workers, scheduler) as doers:
+    with locked(out, ".sweep.lock", "sweep"), _doers(now, devices, workers, scheduler) as doers:
         results = read_results(out / STORE)
-        done, total = 0, len(plan.recordings) + len(plan.fits)
-        for jobs in (plan.recordings, plan.fits):
+        done, total = 0, len(now.recordings) + len(now.fits)
+        for jobs in (now.recordings, now.fits):
             tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
             for task, outcome in doers.outcomes(tasks):
                 result = _result(task, outcome)
@@ -79,7 +83,8 @@ def sweep(
                 _say(done, total, result)
                 if progress is not None:
                     progress(done, total)
-        wanted = {job.id: results[job.id] for job in (*plan.recordings, *plan.fits)}
+        every = (job.id for job in (*plan.recordings, *plan.fits))
+        wanted = {id: results[id] for id in every if id in results}
         write_json(out / NUMBERS, list(wanted.values()))
         atomic_write(out / TABLE, table.markdown(plan, wanted).encode())
         sheets = {scene.name: sheet(plan, scene, out) for scene in plan.scenes}
@@ -132,10 +137,12 @@ def _store(path: Path, result: Result) -> None:
 
 def _say(done: int, total: int, result: Result) -> None:
     about = result.get("error", "as stored")
+    if "refused" in result:
+        about = f"not applied: {result['refused']}"
     if "metrics" in result:
         error = result["metrics"].get("d_mse_x100")
         scored = "no truth" if error is None else f"d {error:.4g}"
         about = f"{scored}, {result['wall_s']:.1f} s"
-    elif "error" not in result and "row" not in result:
+    elif not {"error", "refused", "row"} & result.keys():
         about = f"simulated, {result['wall_s']:.1f} s"
     LOG.info("%d/%d %s: %s", done, total, result["id"], about)

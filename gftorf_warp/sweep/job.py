@@ -17,11 +17,12 @@ import torch
 
 from ..data.files import atomic_path
 from ..data.read import read
-from ..errors import BusyError, GftorfError
+from ..errors import BusyError, GftorfError, InputError
 from ..evaluate.compare import score
 from ..evaluate.panels import Findings, telling_row
 from ..recon.observations import data_hash
 from ..recon.settings import plain
+from ..recon.suitable import check_sequence
 from ..recon.train import chosen_settings, reconstruct
 from ..render.cuda import forget_peak_memory, peak_memory
 from ..sim.simulate import simulate
@@ -106,13 +107,16 @@ def _fitted(task: Task, place: Place) -> Result:
     job, plan = task.job, task.plan
     assert job.row is not None
     sequence = read(sequence_of(job, task.out))
-    chosen: dict[str, Any] = {"images": plan.images, "changes": job.row.changes}
-    usual: dict[str, Any] = {"input": "auto", "ablation": None, "flow": None}
-    settings = chosen_settings(sequence, job.row.preset, **usual, **chosen)
+    chosen = job.row.arguments(plan.images)
+    settings = chosen_settings(sequence, job.row.preset, **chosen)
     kind = torch.device(place.device).type
     key = _hash(plain(settings), job.seed, data_hash(sequence), plan.frames, kind)
     if key == task.known:
         return {"key": key}
+    try:
+        check_sequence(sequence, settings)
+    except InputError as error:  # the row of a table that has another method's
+        return {"key": key, "refused": error.what, "why": error.why}
     chosen |= {"seed": job.seed, "device": place.device, "progress": _while_parent_lives()}
     folder, preset = run_of(job, task.out), job.row.preset
     forget_peak_memory(place.device)  # of the job before in this process

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from ..data.texts import read_toml
-from ..errors import InputError
+from ..errors import InputError, UsageError
 from ..recon import presets
 from ..sim.scenes import SCENES
 from ..sim.settings import SimSettings
 from ..similar import did_you_mean
 
+NAMED = "expected a name of letters, digits and -_.+"
 PLAIN = "plain"  # name of the row without changes
 RANDOM = re.compile(r"random-\d+")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
@@ -22,12 +23,23 @@ KINDS: dict[str, tuple[type, str]] = {
     "scenes": (list, "a list of names of scenes and of folders"),
     "presets": (list, "a list of names of presets"),
     "seeds": (list, "a list of whole numbers"),
-    "one_seed": (list, "a list of presets"),
+    "one_seed": (list, "a list of presets and rows"),
     "images": (int, "a whole number"),
     "frames": (str, '"all" or "ftorf13"'),
     "simulate": (dict, "a table of options of `gftorf simulate`"),
     "changes": (dict, "a table: name = a list of settings NAME=VALUE"),
+    "rows": (dict, "a table: name = a table with a preset and how it differs"),
     "published": (dict, "a table: name = a table of errors by scene"),
+}
+
+
+ROW_KEYS: dict[str, tuple[type, str]] = {
+    "preset": (str, "the name of a preset"),
+    "input": (str, "auto, quads or phasor"),
+    "ablation": (str, "a row of the ablation table"),
+    "flow": (str, "auto, file, dis, deepflow or none"),
+    "images": (int, "a whole number from 1 on"),
+    "changes": (list, "a list of settings NAME=VALUE"),
 }
 
 
@@ -51,11 +63,33 @@ class Row:
     """Single settings, as ``gftorf reconstruct --set`` takes them."""
     label: str = PLAIN
     """Name of these changes."""
+    title: str | None = None
+    """Name of a row of ``rows``; None: that of preset and changes."""
+    input: str = "auto"
+    """What is compared, as ``gftorf reconstruct --input`` takes it."""
+    ablation: str | None = None
+    """Row of the ablation table, as ``--ablation`` takes it."""
+    flow: str | None = None
+    """Source of optical flow, as ``--flow`` takes it."""
+    images: int | None = None
+    """Raw frames that are optimised; None: as many as in the other rows."""
 
     @property
     def name(self) -> str:
         """Its name in tables and folders."""
+        if self.title is not None:
+            return self.title
         return self.preset if self.label == PLAIN else f"{self.preset}+{self.label}"
+
+    def arguments(self, images: int | None) -> dict[str, Any]:
+        """Arguments of ``reconstruct`` beside preset, seed and device; ``images``: those of all."""
+        return {
+            "images": self.images or images,
+            "input": self.input,
+            "ablation": self.ablation,
+            "flow": self.flow,
+            "changes": self.changes,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +127,7 @@ class Plan:
     simulate: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the recording of all scenes that are simulated."""
     one_seed: frozenset[str] = frozenset()
-    """Presets that are fitted with the first seed only."""
+    """Presets and rows that are fitted with the first seed only."""
     published: Mapping[str, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
     """Errors [m^2 x 100] of d, or of d and d_ToF, of others on other data, by name and scene, shown
     beside ours."""
@@ -111,8 +145,24 @@ class Plan:
             for seed in self.seeds
             for scene in self.scenes
             for row in self.rows
-            if seed == self.seeds[0] or (fits(row.preset) and row.preset not in self.one_seed)
+            if seed == self.seeds[0] or self._has_seeds(row)
         ]
+
+    def _has_seeds(self, row: Row) -> bool:
+        return fits(row.preset) and not self.one_seed & {row.preset, row.name}
+
+    def only(self, names: Iterable[str]) -> Plan:
+        """The same with some of its rows.
+
+        Raises:
+            UsageError: If there is no row of a name.
+        """
+        names, known = set(names), [row.name for row in self.rows]
+        for name in names.difference(known):
+            why = did_you_mean(name, known, f"there are {', '.join(known)}")
+            fix = "leave --rows out for all of them"
+            raise UsageError(f"there is no row {name}", where="--rows", why=why, fix=fix)
+        return replace(self, rows=tuple(row for row in self.rows if row.name in names))
 
 
 def fits(preset: str) -> bool:
@@ -134,7 +184,7 @@ def read_plan(path: str | Path) -> Plan:
         kind, wanted = KINDS[key]
         if not isinstance(value, kind) or isinstance(value, bool):
             raise _wrong(path, key, f"expected {wanted}, found {value!r}")
-    for key in ("scenes", "presets"):
+    for key in ("scenes",) if content.get("rows") else ("scenes", "presets"):
         if not content.get(key):
             raise _wrong(path, key, f"expected {KINDS[key][1]}, which is not empty")
     seeds = content.get("seeds", [0])
@@ -142,12 +192,16 @@ def read_plan(path: str | Path) -> Plan:
         raise _wrong(path, "seeds", f"expected whole numbers from 0 on, found {seeds!r}")
     if (images := content.get("images")) is not None and images < 1:
         raise _wrong(path, "images", f"expected at least 1, found {images}")
+    rows = tuple(_rows(content, path))
+    single = content.get("one_seed", [])
+    known = [*presets.PRESETS, *(row.name for row in rows)]
+    _check_keys(_texts(single, "one_seed", path), known, path, "one_seed: ")
     plan = Plan(
         scenes=tuple(_scene(word, path) for word in _texts(content["scenes"], "scenes", path)),
-        rows=tuple(_rows(content, path)),
+        rows=rows,
         seeds=tuple(dict.fromkeys(seeds)),
         images=images,
-        one_seed=frozenset(_presets(content.get("one_seed", []), "one_seed", path)),
+        one_seed=frozenset(single),
         frames=content.get("frames", "all"),
         simulate=_recording(content.get("simulate", {}), path),
         published=_published(content.get("published", {}), path),
@@ -190,26 +244,48 @@ def _scene(word: str, path: Path) -> Scene:
     return Scene(name=name if NAME.fullmatch(name) else "sequence", sequence=folder.resolve())
 
 
-def _presets(names: list, key: str, path: Path) -> list[str]:
-    _check_keys(_texts(names, key, path), presets.PRESETS, path, f"{key}: ")
-    return names
-
-
 def _rows(content: Mapping[str, Any], path: Path) -> Iterable[Row]:
-    """Every preset as it is, and those that fit something with every list of changes."""
-    names = _presets(content["presets"], "presets", path)
+    """Every preset as it is, those that fit something with every list of changes, and the rows that
+    are described one by one.
+    """
+    names = _texts(content.get("presets", []), "presets", path)
+    _check_keys(names, presets.PRESETS, path, "presets: ")
     changes = content.get("changes", {})
     for label, words in changes.items():
         if not NAME.fullmatch(label) or label == PLAIN:
-            raise _wrong(path, f"changes.{label}", "expected a name of letters, digits and -_.+")
+            raise _wrong(path, f"changes.{label}", NAMED)
         if not isinstance(words, list) or not words:
             raise _wrong(path, f"changes.{label}", "expected a list of settings NAME=VALUE")
         _texts(words, f"changes.{label}", path)
+    taken = set()
     for name in dict.fromkeys(names):
         yield Row(preset=name)
+        taken.add(name)
         if fits(name):
             for label, words in changes.items():
-                yield Row(preset=name, changes=tuple(words), label=label)
+                yield (row := Row(preset=name, changes=tuple(words), label=label))
+                taken.add(row.name)
+    for title, given in content.get("rows", {}).items():
+        yield _row(title, given, path)
+        if title in taken:
+            raise _wrong(path, f"rows.{title}", "another row has this name")
+
+
+def _row(title: str, given: Any, path: Path) -> Row:
+    """A row that is described by itself."""
+    where = f"rows.{title}"
+    if not NAME.fullmatch(title):
+        raise _wrong(path, where, NAMED)
+    if not isinstance(given, dict) or "preset" not in given:
+        raise _wrong(path, where, "expected a table with a preset")
+    _check_keys(given, ROW_KEYS, path, f"{where}.")
+    for key, value in given.items():
+        kind, wanted = ROW_KEYS[key]
+        if type(value) is not kind or (kind is int and value < 1):
+            raise _wrong(path, f"{where}.{key}", f"expected {wanted}, found {value!r}")
+    _check_keys([given["preset"]], presets.PRESETS, path, f"{where}.preset: ")
+    changes = tuple(_texts(given.get("changes", []), f"{where}.changes", path))
+    return Row(**given | {"title": title, "changes": changes})
 
 
 def _recording(options: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..evaluate import page
 from ..evaluate.captioned import Picture
 from .job import Result
-from .plan import Plan, Scene
+from .plan import Job, Plan, Row, Scene
 from .sheet import CLOSED_FORM
 
 COLUMNS = {  # title: where it is in metrics.json
@@ -51,8 +51,12 @@ def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
         every = [result for found in by_row.values() for result in found]
         if every:
             lines.append(_closed_form(scene, every[0]))
-        for name, found in by_row.items():
-            lines.append(_line(scene, name, found))
+        for row in plan.rows:
+            lines.append(
+                _line(scene, row.name, by_row[row.name])
+                if by_row[row.name]
+                else _empty(scene, row.name, _why_not(plan, scene, row, results))
+            )
         for name, errors in plan.published.items():
             if scene.name in errors:
                 cells = dict(zip(("all", "d_ToF"), map(_three, errors[scene.name]), strict=False))
@@ -74,6 +78,26 @@ def over_scenes(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
                 cells[title] = f"{mean:.3g}" + _of(len(known), len(ratios))
         lines.append(Line(scene="over the closed form", row=row.name, cells=cells, kind="ours"))
     return lines
+
+
+def _why_not(plan: Plan, scene: Scene, row: Row, results: Mapping[str, Result]) -> str:
+    """In a few words why a row has no numbers; nothing if no job of it says so."""
+    for seed in plan.seeds:
+        result = results.get(Job(scene=scene, row=row, seed=seed).id, {})
+        if "refused" in result:
+            return f"not applied: {result['refused']}"
+        if "error" in result:
+            return "failed"
+    return ""
+
+
+def refusals(results: Iterable[Result]) -> list[str]:
+    """Methods that cannot be applied to a scene, a line each."""
+    return [
+        f"{result['scene']}, {result['row']}: {result['refused']}: {result['why']}"
+        for result in results
+        if "refused" in result
+    ]
 
 
 def failures(results: Iterable[Result]) -> list[str]:
@@ -107,6 +131,7 @@ def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
         text.append(_row([line.scene, line.row, *cells]))
     for notes in assumptions(plan, results).values():
         text += ["", *(f"* {note}" for note in notes)]
+    text += [f"\nnot applied: {refusal}" for refusal in refusals(results.values())]
     text += [f"\nfailed: {failure}" for failure in failures(results.values())]
     return "\n".join(text) + "\n"
 
@@ -119,6 +144,9 @@ def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture
     if failed := failures(results.values()):
         items = "".join(f"<li>{page.escape(failure)}</li>" for failure in failed)
         body += page.section("What failed", f"<ul>{items}</ul>")
+    if refused := refusals(results.values()):
+        items = "".join(f"<li>{page.escape(refusal)}</li>" for refusal in refused)
+        body += page.section("What cannot be applied", f"<ul>{items}</ul>")
     lines = lines_of(plan, results)
     for scene in plan.scenes:
         own = [line for line in lines if line.scene == scene.name]
@@ -179,6 +207,11 @@ def _line(scene: Scene, name: str, found: Sequence[Result]) -> Line:
             cells[title] = f"{np.mean(values):{'.1f' if title == 'seconds' else '.0f'}}"
     marked = name + MARK if any(result.get("assumed") for result in found) else name
     return Line(scene=scene.name, row=marked, cells=cells, kind="ours")
+
+
+def _empty(scene: Scene, name: str, why: str) -> Line:
+    """A row without a result."""
+    return Line(scene=scene.name, row=name, cells={"all": why} if why else {}, kind="ours")
 
 
 def _spread(values: Sequence[float]) -> str:

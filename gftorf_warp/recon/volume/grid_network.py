@@ -85,6 +85,7 @@ class GridNetwork(torch.nn.Module):
             generator: For the weights, on the CPU.
         """
         super().__init__()
+        self.moving_rate, self.flow_rate = settings.moving_rate, settings.flow_rate
 
         def grid(levels: int, coarsest: int, growth: float, times: int) -> HashGrid:
             cells = [int(coarsest * growth**k) for k in range(levels)]
@@ -132,7 +133,7 @@ class GridNetwork(torch.nn.Module):
         resting = self.resting(points.flatten(0, 1)[None], self.never).unflatten(
             1, points.shape[:2]
         )[0]
-        features = torch.cat([resting, self.moving(points, times)], dim=-1)
+        features = torch.cat([resting, self.moving_rate * self.moving(points, times)], dim=-1)
         return self.trunk_head(functional.relu(self.hidden(features)))
 
     def density(self, trunk: Float[Tensor, "*n v"]) -> Float[Tensor, "*n"]:
@@ -151,5 +152,5 @@ class GridNetwork(torch.nn.Module):
     ) -> Float[Tensor, "T P 2 3"]:
         """Displacement to the next quartet and to the one before [m], at most ``reach`` each."""
         hidden = functional.relu(self.flow_hidden(self.flowing(points, times)))
-        found = reach * torch.tanh(self.flow_head(hidden).float())
+        found = reach * torch.tanh(self.flow_rate * self.flow_head(hidden).float())
         return found.unflatten(-1, (2, 3))

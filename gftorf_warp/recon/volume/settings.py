@@ -116,6 +116,11 @@ class GridSettings:
     """Cells along an axis from one level to the next [1]."""
     flow_growth: float = 1.3
     """The same for the scene flow."""
+    moving_rate: float = 1.0
+    """Factor in front of the features of the grid that every quartet has, by which it learns more
+    slowly than the one that knows no time [1]."""
+    flow_rate: float = 0.01
+    """Factor in front of the last layer of the scene flow, by which it learns more slowly [1]."""
     rows_log2: int = 19
     """Rows of a level at most, as a power of two; more vertices share them."""
     width: int = 64
@@ -219,4 +224,5 @@ def settings_of(stored: dict[str, Any]) -> VolumeSettings:
 def _grid_of(stored: dict[str, Any] | None) -> GridSettings | None:
     if stored is None:
         return None
-    return GridSettings(**stored | {"occupancy": OccupancySettings(**stored["occupancy"])})
+    older = {"flow_rate": 1.0, "moving_rate": 1.0}  # of runs that do not state it
+    return GridSettings(**older | stored | {"occupancy": OccupancySettings(**stored["occupancy"])})
