@@ -97,6 +97,18 @@ def averaged_locally(sequence: Sequence) -> tuple[Sequence, Int[np.ndarray, "Q H
     return replace(sequence, quads=quads), count
 
 
+def averaged_or_locally(sequence: Sequence) -> tuple[Sequence, Int[np.ndarray, "Q H W"]]:
+    """:func:`averaged` where a complete quartet agrees, else :func:`averaged_locally`, and the
+    number of quartets in each mean.
+    """
+    agrees, (local, count) = agreement(sequence), averaged_locally(sequence)
+    quads, means = local.quads.copy(), averaged(sequence).quads
+    for i, there in zip(sequence.complete_quartets, agrees, strict=True):
+        frames = sequence.quartet_frames(i)
+        quads[frames] = np.where(there, means[frames], quads[frames])
+    return replace(sequence, quads=quads), np.where(agrees, agrees.sum(axis=0), count)
+
+
 def sigma_of_mean(
     sequence: Sequence, noise: QuadNoise, count: Int[np.ndarray, "*q H W"]
 ) -> Float[np.ndarray, "*q H W"]:

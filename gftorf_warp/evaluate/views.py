@@ -112,16 +112,17 @@ def gather(
     }
     first, *further = sequence.frequencies
     renderers = {first: run.renderer(RENDERED, corrected=False)}
-    renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
+    renderers |= {f: run.renderer(RENDERED, f_mod_hz=f, corrected=False) for f in further}
     for count, n in enumerate(frames, start=1):
         time = float(sequence.times[n])
-        light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
+        camera = camera_at(run, sequence, time)
+        light = {f: render(time, camera) for f, render in renderers.items()}
         fit, measured = light[first], light[float(sequence.frame_frequencies[n])]
-        rendering = run.corrected(fit, time, camera_at(run, sequence, time))
+        rendering = run.corrected(fit, time, camera)
         if rendering.source is not None:
             rows.setdefault("d_fit", []).append(fit.distance.cpu().numpy().copy())
             rows.setdefault("source", []).append(rendering.source.cpu().numpy())
-        others = [light[f].quads for f in further]
+        others = [run.corrected(light[f], time, camera, f).quads for f in further]
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,

@@ -93,18 +93,11 @@ class Fallback:
             return None
         explained = _enlarged(~found.unexplained, sequence)
         chi_square = _enlarged(found.chi_square, sequence)
-        agrees, averaged = temporal.agreement(sequence), temporal.averaged(sequence)
-        local, count = temporal.averaged_locally(sequence)
-        quads = np.where(
-            agrees[:, None], temporal.stacked_quads(averaged), temporal.stacked_quads(local)
-        )
+        agrees = temporal.agreement(sequence)
+        averaged, count = temporal.averaged_or_locally(sequence)
         quartets = sequence.complete_quartets
-        mean = np.where(
-            agrees,
-            np.stack([closed_form_distance(averaged, i) for i in quartets]),
-            np.stack([closed_form_distance(local, i) for i in quartets]),
-        )
-        of_mean = _chi_square(sequence, quads, noise)
+        mean = np.stack([closed_form_distance(averaged, i) for i in quartets])
+        of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
         odds = _odds(found.changing_unexplained_share, found)
@@ -118,7 +111,6 @@ class Fallback:
             moved &= ~agrees & (count == 1)
         else:  # a chi-square that is not finite is none
             moved = (of_phasor <= CHI_SQUARE_MAX) | ~(chi_square < of_phasor)
-        count = np.where(agrees, agrees.sum(axis=0), count)
         stays = math.sqrt(2.0 * math.log(_odds(found.contradicted_share, found)))
 
         def tensor(image: np.ndarray) -> Tensor:

@@ -1,18 +1,25 @@
 """The phasor of a pixel as well as it is known: rendered, and corrected by what was measured.
 
-Gaussians explain a pixel that mixes two surfaces only in part. Seen from the sequence's own camera,
-more is known of it:
+Gaussians explain a pixel that mixes two surfaces only in part, and every pixel a little wrong. Seen
+from the sequence's own camera, more is known of it:
 
-* where a quartet agrees with the temporal mean (data/temporal.py), the phasor of that mean;
-* at the time of a raw frame, one of the two components of the phasor: twice the quad is the
-  component along its shift. The other one stays rendered, and the residuals of the quad nearby tell
-  how wrong a rendered component is.
+* where a quartet agrees with the temporal mean, or measured the same as a neighbour in time
+  (data/temporal.py), the phasor of their mean; where the fallback has taken the closed form, that
+  of the quartet;
+* at the time of a raw frame, one of the two components of the phasor: without a DC offset, twice
+  the quad is the component along its shift. The other one stays rendered, and the residuals of the
+  quad nearby tell how wrong a rendered component is.
+
+Measurements are noisy and renderings smooth. What a residual exceeds its noise by, in the mean over
+3x3 pixels, is the error of the rendering: its share of both is the share of the residual that is
+taken over (a Wiener filter). So recordings without noise give the measured phasor, and noisy ones
+the rendered one where it is right.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,17 +27,20 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from ..data import temporal
+from ..constants import SOURCES
 from ..data.cycles import solution
 from ..data.decode import quartet_phasors
 from ..data.noise import amplitudes_of, quad_noise
 from ..data.sequence import Sequence
+from ..data.temporal import averaged_or_locally
 from ..render.api import Rendering
 from ..scene.camera import Camera
-from ..scene.sensor import quad_from_phasor
+from ..scene.sensor import Sensor, quad_from_phasor
 from . import closed_form
 
 MODEL_ERROR = 0.01  # of a rendered component at least, of the largest amplitude within 3x3 pixels
+CLOSED_FORM = SOURCES.index("closed_form")
+LEAST = 1e-30  # instead of a division by zero
 MEDIAN_SQUARE = 0.4549  # of a standard normal distribution
 
 
@@ -46,6 +56,19 @@ class Phasor:
     """Of the imaginary parts."""
     covariance: Float[Tensor, "H W"]
     """Of both."""
+
+    def within(self, rendering: Rendering, sensor: Sensor) -> Rendering:
+        """A rendering with this phasor, and quads of the sensor that decode to it."""
+        re, im, amplitude = rendering.phasor
+        value = self.value
+        longer = value.abs() - torch.hypot(re, im)
+        constant = float(sensor.dc_offset) * longer
+        quads = rendering.quads
+        if quads.numel():
+            change = value.real - re, value.imag - im, constant
+            quads = quads + torch.stack([quad_from_phasor(*change, s) for s in sensor.shifts])
+        phasor = torch.stack([value.real, value.imag, amplitude + longer])
+        return replace(rendering, quads=quads, phasor=phasor)
 
 
 def rendered_phasor(rendering: Rendering) -> Phasor:
@@ -69,16 +92,18 @@ class MeasuredPhasors:
     """What was measured."""
     camera: Camera
     """The camera of raw frame 0."""
-    mean: Complex[Tensor, "f H W"]
-    """Temporal mean of the quartets that agree, at each frequency; 0 where none does."""
-    variance: Float[Tensor, "H W"]
-    """Of each component of that mean [quad units^2], from the noise."""
-    agrees: Bool[Tensor, "Q H W"]
-    """Which quartets agree."""
+    value: Complex[Tensor, "Q f H W"]
+    """Phasor of each quartet at each frequency, the mean over those that measured the same."""
+    variance: Float[Tensor, "Q H W"]
+    """Of each of its components, from the noise [quad units^2]."""
+    averaged: Bool[Tensor, "Q H W"]
+    """Where it is a mean of several quartets."""
+    of_quads: Float[Tensor, "K H W"]
+    """Variance of the quad of every slot, from the noise [quad units^2]."""
 
     @classmethod
     def of(cls, sequence: Sequence, camera: Camera, device: torch.device) -> MeasuredPhasors | None:
-        """The temporal means of a sequence on a device; None if no quartet is complete.
+        """The phasors of a sequence on a device; None if no quartet is complete.
 
         Args:
             sequence: What was measured.
@@ -88,24 +113,25 @@ class MeasuredPhasors:
         noise = quad_noise(sequence)
         if noise is None:
             return None
-        agrees, quartets = temporal.agreement(sequence), sequence.complete_quartets
-        count = np.maximum(agrees.sum(axis=0), 1)
-        mean = np.zeros((len(sequence.frequencies), *count.shape), dtype=np.complex64)
-        for i, there in zip(quartets, agrees, strict=True):
-            for k, (_, (re, im)) in enumerate(quartet_phasors(sequence, i)):
-                mean[k] += there * (re + 1j * im) / count
+        quartets, (mean, count) = sequence.complete_quartets, averaged_or_locally(sequence)
+        value = [[re + 1j * im for _, (re, im) in quartet_phasors(mean, i)] for i in quartets]
         frames = quartet_phasors(sequence, quartets[0])[0][0]
         rows = solution(sequence.shifts[frames])
         assert rows is not None  # or the quartet would have no phasor
         light = np.median([amplitudes_of(sequence, i) for i in quartets], axis=0)
-        of_quad = np.square(noise.sigma(light)).mean(axis=0)
-        variance = 0.5 * np.square(rows).sum() * of_quad / count
+        of_quads = np.square(noise.sigma(light))
+        variance = 0.5 * np.square(rows).sum() * of_quads.mean(axis=0) / count
+
+        def tensor(image: np.ndarray, kind: torch.dtype) -> Tensor:
+            return torch.as_tensor(image, device=device, dtype=kind)
+
         return cls(
             sequence=sequence,
             camera=camera,
-            mean=torch.as_tensor(mean, device=device),
-            variance=torch.as_tensor(variance, device=device, dtype=torch.float32),
-            agrees=torch.as_tensor(agrees.copy(), device=device),
+            value=tensor(np.array(value), torch.complex64),
+            variance=tensor(variance, torch.float32),
+            averaged=tensor(count > 1, torch.bool),
+            of_quads=tensor(of_quads, torch.float32),
         )
 
     def corrected(
@@ -114,47 +140,76 @@ class MeasuredPhasors:
         """The phasor of a rendering, corrected where more is known.
 
         Args:
-            rendering: With its phasor at that frequency.
+            rendering: With its phasor at that frequency, and the map of sources of the fallback.
             time: Of the rendering [s].
             camera: Of the rendering.
             f_mod_hz: Modulation frequency [Hz].
         """
-        phasor, sequence = rendered_phasor(rendering), self.sequence
+        rendered, sequence = rendered_phasor(rendering), self.sequence
         row = closed_form.row_of(sequence, time, camera, self.camera)
         if row is None or f_mod_hz not in sequence.frequencies:
-            return phasor
+            return rendered
         n = int(np.abs(sequence.times - time).argmin())
         at_frame = abs(sequence.times[n] - time) <= closed_form.TIME_S
-        if at_frame and sequence.measured[n] and sequence.frame_frequencies[n] == f_mod_hz:
-            phasor = self._with_quad(phasor, rendering, n)
-        there, mean = self.agrees[row], self.mean[sequence.frequencies.index(f_mod_hz)]
-        error = torch.minimum(phasor.variance_re, phasor.variance_im)
-        variance = self.variance + error
+        phasor, one_tap = rendered, sequence.calibration.dc_offset != 0.0
+        if at_frame and not one_tap and sequence.measured[n]:
+            if sequence.frame_frequencies[n] == f_mod_hz:
+                phasor = self._with_quad(rendered, n)
+        there = self.averaged[row]
+        if rendering.source is not None:
+            there = there | (rendering.source == CLOSED_FORM)
+        residual = self.value[row, sequence.frequencies.index(f_mod_hz)] - rendered.value
+        variance = self.variance[row]
+        share = _share_of_error(0.5 * residual.abs().square(), variance, there)
+        variance = rendered.variance_re + share * variance
         return Phasor(
-            value=torch.where(there, mean, phasor.value),
+            value=torch.where(there, rendered.value + share * residual, phasor.value),
             variance_re=torch.where(there, variance, phasor.variance_re),
             variance_im=torch.where(there, variance, phasor.variance_im),
             covariance=phasor.covariance.masked_fill(there, 0.0),
         )
 
-    def _with_quad(self, phasor: Phasor, rendering: Rendering, n: int) -> Phasor:
+    def _with_quad(self, rendered: Phasor, n: int) -> Phasor:
         """With the component of raw frame n.
 
         Its error is that of the median residual of the image: noise, and light that the model lacks
         everywhere.
         """
-        re, im, amplitude = rendering.phasor
-        shift, offset = float(self.sequence.shifts[n]), self.sequence.calibration.dc_offset
+        re, im = rendered.value.real, rendered.value.imag
+        shift = float(self.sequence.shifts[n])
         measured = torch.as_tensor(self.sequence.quads[n], device=re.device, dtype=re.dtype)
-        residual = 2.0 * (measured - quad_from_phasor(re, im, offset * amplitude, shift))
+        residual = 2.0 * (measured - quad_from_phasor(re, im, 0.0, shift))
         square = residual.square()
-        nearby = avg_pool2d(square[None], 3, stride=1, padding=1, count_include_pad=False)[0]
-        along = phasor.variance_re + square.median() / MEDIAN_SQUARE
-        across = phasor.variance_re + nearby
+        share = _share_of_error(square, 4.0 * self.of_quads[n % self.sequence.cycle])
+        along = rendered.variance_re + square.median() / MEDIAN_SQUARE
+        across = rendered.variance_re + _mean(square)
         cosine, sine = math.cos(shift), math.sin(shift)
+        taken = share * residual
         return Phasor(
-            value=phasor.value + torch.complex(residual * cosine, residual * sine),
+            value=rendered.value + torch.complex(taken * cosine, taken * sine),
             variance_re=along * cosine**2 + across * sine**2,
             variance_im=along * sine**2 + across * cosine**2,
             covariance=(along - across) * cosine * sine,
         )
+
+
+def _share_of_error(
+    square: Float[Tensor, "H W"],
+    noise: Float[Tensor, "H W"],
+    where: Bool[Tensor, "H W"] | None = None,
+) -> Float[Tensor, "H W"]:
+    """Share of squared residuals that is error of the rendering [1], the rest being noise, in the
+    mean over 3x3 pixels; of those ``where`` something was measured.
+    """
+    excess = square - noise
+    if where is not None:
+        excess = _mean(excess * where) / _mean(where.to(excess)).clamp_min(LEAST)
+    else:
+        excess = _mean(excess)
+    excess = excess.clamp_min(0.0)
+    return excess / (excess + noise).clamp_min(LEAST)
+
+
+def _mean(image: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Means over 3x3 pixels."""
+    return avg_pool2d(image[None], 3, stride=1, padding=1, count_include_pad=False)[0]

@@ -81,8 +81,7 @@ class Subject:
         first, *further = self.sequence.frequencies
         self._renderers = {}
         if run is not None:
-            # corrections of a run that goes on would be decided anew for every state
-            self._renderers[first] = run.renderer(RENDERED, corrected=self.finished)
+            self._renderers[first] = run.renderer(RENDERED, corrected=False)
             for f in further:
                 self._renderers[f] = run.renderer(RENDERED, f_mod_hz=f, corrected=False)
         self.__dict__.pop("residuals", None)  # of the run before
@@ -130,10 +129,14 @@ class Subject:
     @torch.no_grad()
     def _render(self, n: int, f: float) -> dict[str, np.ndarray]:
         assert self.run is not None, "a sequence alone has nothing to render"
-        image = self._renderers[f](float(self.sequence.times[n]), self.recording.camera(n))
+        time, camera = float(self.sequence.times[n]), self.recording.camera(n)
+        fit = image = self._renderers[f](time, camera)
+        # corrections of a run that goes on would be decided anew for every state
+        if self.finished and f == self.sequence.frequencies[0]:
+            image = self.run.corrected(fit, time, camera)
         found = {k: getattr(image, k).cpu().numpy().copy() for k in ("distance", "opacity")}
         shifts = self.sequence.shifts[: self.sequence.cycle]
-        slots = [quad_of_shift(image, self.run.sensor, float(shift)) for shift in shifts]
+        slots = [quad_of_shift(fit, self.run.sensor, float(shift)) for shift in shifts]
         return found | {"slots": np.stack([slot.cpu().numpy() for slot in slots])}
 
     def ours(self, n: int) -> Mapping[str, np.ndarray] | None:

@@ -31,6 +31,7 @@ from . import gaussians
 from .stored import StoredRun, at_frequency
 
 LOG = logging.getLogger("gftorf_warp")
+CORRECTED = {"distance", "quads", "phasor"}  # by the settings fallback and outlines
 KINDS: dict[str, type[Run]] = {}
 """The class of each method, and of ``windows``; ``recon/run.py`` fills it."""
 
@@ -112,7 +113,7 @@ class Run(StoredRun):
 
         With the settings ``fallback`` and ``outlines``, the distance is that of the measurement
         where this knows better, and of one of two surfaces in mixed pixels, which ``source``
-        states.
+        states. With ``fallback``, quads and phasor too are corrected by what was measured.
 
         Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in
         those of its colour images, distances in metres. No gradients. Before the first raw frame
@@ -132,15 +133,19 @@ class Run(StoredRun):
         self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
     ) -> Rendering:
         """A rendering, with its phasor, after the settings ``fallback`` and ``outlines``."""
+        if not self._corrects:
+            return rendering
         if self.fallback is not None:
             rendering = self.fallback.applied(rendering, time, camera)
+        sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
+        phasor = None
+        if measured is not None:
+            phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
         if self.config["settings"].get("outlines"):
-            sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
-            phasor = None
-            if measured is not None:
-                phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
             rendering = outlines.resolved(rendering, sensor, phasor)
-        return rendering
+        if phasor is None or self.fallback is None:
+            return rendering
+        return phasor.within(rendering, sensor)
 
     def renderer(
         self,
@@ -162,9 +167,9 @@ class Run(StoredRun):
             corrected: Whether the settings ``fallback`` and ``outlines`` apply.
         """
         names = frozenset(images) - {"source"}
-        corrected = corrected and "distance" in names and self._corrects
+        corrected = corrected and bool(names & CORRECTED) and self._corrects
         if corrected:
-            names |= {"phasor"}
+            names |= {"distance", "phasor"}
         replay = gaussians.replay_of(self, names, f_mod_hz)
         if not corrected:
             return replay

@@ -21,7 +21,7 @@ from ..joined import Joined, Window, folder_of, refused
 from ..read_back import ReadBack
 from ..settings import Method
 from . import gaussians
-from .base import Run
+from .base import CORRECTED, Run
 from .empty import WithoutGaussians, with_empty_extra
 
 
@@ -95,8 +95,8 @@ class WindowedRun(WithoutGaussians):
         names = frozenset(images)
         settings = self.config["settings"]
         corrects = settings.get("outlines") or settings.get("fallback")
-        corrects = corrects and corrected and "distance" in names
-        needed = names | {"phasor"} if corrects else names
+        corrects = corrects and corrected and bool(names & CORRECTED)
+        needed = names | {"distance", "phasor"} if corrects else names
         renderers: Joined[Callable[[float, Camera], Rendering]] = self.joined.mapped(
             lambda window: window.renderer(needed, f_mod_hz=f_mod_hz, corrected=False)
         )
