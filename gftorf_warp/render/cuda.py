@@ -92,6 +92,7 @@ def capture(
     """
     runtime.start()
     mode = "thread_local"  # Warp's own assumption
+    _warp_stream(torch.cuda.current_stream())  # Warp's first use of a GPU must not be captured
     with (  # no runtime.LAUNCHING: autograd's thread launches the backward pass, and would wait
         without_garbage_collection(),
         torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode),
