@@ -16,18 +16,26 @@ from __future__ import annotations
 
 import argparse
 import logging
+import multiprocessing
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+import atheris
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 OURS = ("data", "importers", "scene.falloff", "sim.mesh_file", "sim.scene_file")
-OTHERS = ("tomllib", "trimesh.exchange", "numpy.lib.format", "numpy.lib._format_impl")
+OTHERS = ("tomllib", "trimesh.exchange")
+INSTRUMENTED = [*(f"gftorf_warp.{part}" for part in OURS), *OTHERS]
+with atheris.instrument_imports(include=INSTRUMENTED):
+    from damaged_files import READERS, whole
+
+    from gftorf_warp.errors import GftorfError
+
 LIMITS = ("-timeout=10", "-rss_limit_mb=4096", "-max_len=262144", "-reload=0")
 ENDED = re.compile(r"cov: (\d+) .*corp: (\d+)/")
 RUNS = re.compile(r"stat::number_of_executed_units: (\d+)")
@@ -35,16 +43,11 @@ RUNS = re.compile(r"stat::number_of_executed_units: (\d+)")
 
 def fuzz(name: str, corpus: Path, seconds: int) -> None:
     """Fuzz one reader until the time is over or something is found; ends the process."""
-    import atheris
-
-    logging.disable()
-    included = [*(f"gftorf_warp.{part}" for part in OURS), *OTHERS]
-    with atheris.instrument_imports(include=included):
-        from damaged_files import READERS, whole
-
-        from gftorf_warp.errors import GftorfError
-
-        reader, place = READERS[name], Path(tempfile.mkdtemp()) / "files"
+    log = os.open(corpus.parent / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(log, sys.stdout.fileno())
+    os.dup2(log, sys.stderr.fileno())
+    reader, place = READERS[name], Path(tempfile.mkdtemp()) / "files"
+    with atheris.instrument_imports(include=INSTRUMENTED):
         shutil.copytree(whole(name), place)
         reader.read(place)  # imports what it needs
     files = [path for path in sorted(place.glob(reader.damaged)) if path.is_file()]
@@ -74,36 +77,30 @@ def row(name: str, place: Path, seconds: int) -> tuple[list[str], bool]:
     """Cells of a reader after its time, and whether it ended otherwise than by its time."""
     corpus = place / name / "inputs"
     corpus.mkdir(parents=True, exist_ok=True)
-    words = [sys.executable, __file__, "--one", name, "--corpus", str(corpus)]
     with tempfile.TemporaryDirectory() as temporary:
-        done = subprocess.run(
-            [*words, "--seconds", str(seconds)],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            env=os.environ | {"TMPDIR": temporary},
-            check=False,
+        tempfile.tempdir = temporary  # of the process, too
+        process = multiprocessing.get_context("fork").Process(
+            target=fuzz, args=(name, corpus, seconds)
         )
-    (place / name / "log.txt").write_text(done.stdout + done.stderr)
-    covered, runs = ENDED.findall(done.stderr), RUNS.findall(done.stderr)
+        process.start()
+        process.join()
+        tempfile.tempdir = None
+    log = (place / name / "log.txt").read_text(errors="replace")
+    covered, runs = ENDED.findall(log), RUNS.findall(log)
     lines, inputs = covered[-1] if covered else ("-", "-")
-    found = done.returncode != 0
+    found = process.exitcode != 0
     tried, verdict = runs[-1] if runs else "-", "see log.txt" if found else "none"
     return [name, tried, lines, inputs, verdict], found
 
 
 def main() -> int:
-    """Readers one after the other; 1 if anything was found."""
+    """Readers one after the other, each in a process of its own; 1 if anything was found."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--seconds", type=int, default=60, help="for each reader")
     parser.add_argument("--only", nargs="+", help="readers, as in tests/damaged_files.py")
     parser.add_argument("--corpus", type=Path, default=Path("fuzz-corpus"), help="inputs and logs")
-    parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.one:
-        fuzz(options.one, options.corpus, options.seconds)
-    from damaged_files import READERS
-
+    logging.disable()
     names = [name for name, reader in READERS.items() if not reader.protected]
     names = [name for name in names if "run" not in name and "checkpoint" not in name]
     print("| files | inputs tried | edges reached | inputs kept | found |\n|---|---|---|---|---|")

@@ -35,7 +35,7 @@ class Command:
     before: Callable[[], object] = lambda: None
     """Called before it, after ``written`` was removed."""
     run: Path | None = None
-    """A run whose newest checkpoint must always load; None: it works on none."""
+    """A run, or a folder of runs, whose newest checkpoints must always load; None: none."""
 
     def reset(self) -> None:
         """As before the command."""
@@ -46,11 +46,11 @@ class Command:
         self.before()
 
     def loads(self) -> bool:
-        """Whether the newest checkpoint of its run loads, if it has any."""
-        if self.run is None or not (self.run / "ckpt").is_dir():
-            return True
-        checkpoint.last(self.run)  # raises if it does not
-        return not list((self.run / "ckpt").glob(".*.tmp-*"))
+        """Whether the newest checkpoint of each of its runs loads, if it has any."""
+        stored = [] if self.run is None else [*self.run.rglob("ckpt")]
+        for folder in stored:
+            checkpoint.last(folder.parent)  # raises if it does not
+        return not any([*folder.glob(".*.tmp-*")] for folder in stored)
 
 
 def commands(inputs: Path, place: Path, size: str, frames: int) -> dict[str, Command]:
@@ -79,7 +79,7 @@ def commands(inputs: Path, place: Path, size: str, frames: int) -> dict[str, Com
         name: Command(
             words=[*given, "--out", str(place / given[0])],
             written=place / given[0],
-            run=place / given[0] if name == "reconstruct" else None,
+            run=place / given[0] if name in ("reconstruct", "sweep") else None,
         )
         for name, given in words.items()
     }

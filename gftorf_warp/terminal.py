@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -21,6 +22,11 @@ WORD_MAX = 240  # characters of a word in a message; a path of several folders h
 LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
 # of Warp's native code; our first line reports it
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+# of torch, OpenCV, Python's threads, and the loader of libraries
+OUT_OF_MEMORY = (
+    *("can't allocate memory", "Insufficient memory", "std::bad_alloc"),
+    *("can't start new thread", "failed to map segment"),
+)
 
 
 class Progress:
@@ -134,8 +140,7 @@ def as_known_error(error: BaseException) -> GftorfError | None:
     if isinstance(error, GftorfError):
         return error
     text = str(error)
-    of_torch = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
-    if of_torch or isinstance(error, MemoryError):
+    if _is_out_of_memory(error, text):
         return ResourceError(
             "out of memory",
             where=text.splitlines()[0][:120] if text else "this process",
@@ -144,14 +149,22 @@ def as_known_error(error: BaseException) -> GftorfError | None:
         )
     if not isinstance(error, OSError):
         return None
-    import errno
-
     where, why = error.filename or "a file", error.strerror or text
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         fix = "free disk space, or choose another --out"
         return ResourceError("no space left", where=where, why=why, fix=fix)
     fix = "check the path and its permissions"
     return InputError("cannot read or write", where=where, why=why, fix=fix)
+
+
+def _is_out_of_memory(error: BaseException, text: str) -> bool:
+    """Whether an error with this text says that there is no memory: Python's, torch's, of a thread
+    or a process that cannot start, or of a library that cannot be loaded.
+    """
+    if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EAGAIN):
+        return True
+    named = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    return named or any(words in text for words in OUT_OF_MEMORY)
 
 
 def print_error(error: BaseException, *, debug: bool) -> int:

@@ -1,10 +1,12 @@
 """Sweeps of tiny scenes: plans, resumption, lost processes, failures, tables, a Dask cluster."""
 
+import errno
 import json
 import os
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -240,16 +242,83 @@ def sleep(task, place):  # noqa: ARG001
     time.sleep(task)
 
 
+def pid(task, place):  # noqa: ARG001
+    """Which process does the work."""
+    return os.getpid()
+
+
+def cannot_load():
+    """What the loader says without memory."""
+    raise ImportError("libtorch: failed to map segment")
+
+
+class Unloadable:
+    """Work that no process can load."""
+
+    def __reduce__(self):
+        return cannot_load, ()
+
+
 @pytest.mark.parametrize(("deaths", "outcome"), [(1, (1, "cpu")), (9, None)])
 def test_a_lost_process_costs_a_try(tmp_path, deaths, outcome):
     """The task is done by another one, at most three times."""
     with Workers([Place("cpu")], die_once) as workers:
         ((_, found),) = workers.outcomes([(str(tmp_path), deaths)])
     if outcome is None:
-        assert found == Lost("its process ended with exit code -9")
+        assert found == Lost("its process was ended by a signal (Killed), as when memory is short")
         assert len(list(tmp_path.iterdir())) == 3
     else:
         assert found == outcome
+
+
+def test_a_process_that_is_killed_while_it_is_idle_is_replaced():
+    """The next task is done by another one."""
+    with Workers([Place("cpu")], pid) as workers:
+        ((_, first),) = workers.outcomes([0])
+        os.kill(first, signal.SIGKILL)
+        ((_, second),) = workers.outcomes([0])
+    assert second != first
+
+
+def test_a_process_that_cannot_import_its_work_says_so():
+    """As one with too little memory: it is not tried again, and its place is free for others."""
+    with Workers([Place("cpu")], Unloadable()) as workers:
+        found = [outcome for _, outcome in workers.outcomes([0, 1])]
+    assert found == [Lost("its process could not begin: libtorch: failed to map segment")] * 2
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, "no memory"),
+        cv2.error("std::bad_alloc"),
+    ],
+    ids=["array", "thread", "process", "opencv"],
+)
+def test_a_job_without_memory_says_so(swept, tmp_path, monkeypatch, error):
+    """It is no bug of ours: the exit code is 5."""
+
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr("gftorf_warp.sweep.job.reconstruct", fails)
+    plan = read_plan(swept[0] / "plan.toml")
+    job = next(job for job in plan.fits if job.scene.sequence is not None)
+    result = do(Task(job=job, plan=plan, out=tmp_path), Place("cpu"))
+    assert result["error"].startswith("out of memory")
+    assert result["exit_code"] == 5
+
+
+def test_a_scene_that_could_not_be_simulated_is_named_by_its_fits(swept, tmp_path):
+    """They are not tried; the other scene is done, and the exit code is that of memory."""
+    settings = {"size": (30_000, 30_000), "frames": 8}  # refused before any work
+    plan = replace(read_plan(swept[0] / "plan.toml"), rows=(Row(preset="ctof"),), simulate=settings)
+    results = sweep(plan, tmp_path / "out", workers=1)
+    assert results["demo/ctof-0"]["error"].startswith("without its scene: not enough memory")
+    assert "error" not in results["box/ctof-0"]
+    assert table.exit_code(results.values()) == 5
 
 
 def test_processes_end_with_their_owner():

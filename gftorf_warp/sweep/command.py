@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..data.files import atomic_write, write_json
 from ..data.images import png_bytes
 from ..data.lock import locked
-from ..errors import UsageError
+from ..errors import ResourceError, UsageError
 from . import table
 from .cluster import Cluster
 from .job import Result, Task, do
@@ -74,7 +74,7 @@ def sweep(
         done, total = 0, len(now.recordings) + len(now.fits)
         for jobs in (now.recordings, now.fits):
             tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
-            for task, outcome in doers.outcomes(tasks):
+            for task, outcome in _outcomes(doers, tasks, results):
                 result = _result(task, outcome)
                 if "error" in result or result["key"] != _key(results, task.job):
                     _store(out / STORE, result)
@@ -106,11 +106,25 @@ def _doers(
     return Workers(places(list(devices), count), do)
 
 
+def _outcomes(
+    doers: Workers | Cluster, tasks: list[Task], results: dict[str, Result]
+) -> Iterator[tuple[Task, Any]]:
+    """Tasks with their outcomes; at once, without an attempt, where the scene was not simulated."""
+    possible = []
+    for task in tasks:
+        simulated = results.get(Job(scene=task.job.scene).id, {})
+        if task.job.row is not None and task.job.scene.sequence is None and "error" in simulated:
+            yield task, {**simulated, "error": f"without its scene: {simulated['error']}"}
+        else:
+            possible.append(task)
+    yield from doers.outcomes(possible)
+
+
 def _result(task: Task, outcome: Any) -> Result:
-    if not isinstance(outcome, Lost):
-        return outcome
     known = {"id": task.job.id, "scene": task.job.scene.name, "seed": task.job.seed}
-    return known | {"error": outcome.why, "exit_code": 1}
+    if isinstance(outcome, Lost):
+        return known | {"error": outcome.why, "exit_code": ResourceError.exit_code}
+    return outcome | known
 
 
 def _key(results: dict[str, Result], job: Job) -> str | None:

@@ -17,7 +17,7 @@ import torch
 
 from ..data.files import atomic_path
 from ..data.read import read
-from ..errors import BusyError, GftorfError, InputError
+from ..errors import BusyError, InputError
 from ..evaluate.compare import score
 from ..evaluate.panels import Findings, telling_row
 from ..recon.observations import data_hash
@@ -26,7 +26,7 @@ from ..recon.suitable import check_sequence
 from ..recon.train import chosen_settings, reconstruct
 from ..render.cuda import forget_peak_memory, peak_memory
 from ..sim.simulate import simulate
-from ..terminal import start_warp
+from ..terminal import as_known_error, start_warp
 from .plan import Job, Plan
 from .workers import Place
 
@@ -75,14 +75,20 @@ def do(task: Task, place: Place) -> Result:
         known["row"] = task.job.row.name
     try:
         result = _fitted(task, place) if task.job.row is not None else _simulated(task, place)
-    except GftorfError as error:
-        text = " ".join(f"{error.what} - {error.where}: {error.why}".split())
-        result = {"error": text, "exit_code": error.exit_code}
     except Exception as error:  # one job never ends the others
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
-        result = {"error": text, "exit_code": 1}
+        result = _failure(error)
     return {**known, **result, "wall_s": time.monotonic() - begun}
+
+
+def _failure(error: Exception) -> Result:
+    """What a result says of an error."""
+    known = as_known_error(error)
+    if known is not None:
+        text = " ".join(f"{known.what} - {known.where}: {known.why}".split())
+        return {"error": text, "exit_code": known.exit_code}
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+    return {"error": text, "exit_code": 1}
 
 
 def _begin(place: Place) -> None:

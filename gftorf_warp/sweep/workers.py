@@ -1,7 +1,8 @@
 """Processes of this machine that work on tasks, each with its device and its share of the CPUs.
 
 A process that is lost, by a crash or a signal, costs its task one of a few tries: another process
-does it again, and whatever stores checkpoints goes on from them.
+does it again, and whatever stores checkpoints goes on from them. One that cannot even import what
+it needs says why.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import logging
 import math
 import multiprocessing
 import os
+import pickle
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,7 +40,7 @@ class Lost:
     """The outcome of a task whose processes all ended before it was done."""
 
     why: str
-    """How the last one ended."""
+    """How the last one ended, or why it could not begin."""
 
 
 @dataclass
@@ -110,24 +113,39 @@ class Workers:
                 worker, task, attempt = self._busy.pop(connection)
                 try:
                     outcome = connection.recv()
-                    self._idle.append(worker)
                 except (EOFError, OSError):
-                    worker.process.join()
-                    self._free.append(worker.place)
+                    outcome = self._ended(worker)
                     if attempt < tries:
                         waiting.append((task, attempt + 1))
                         continue
-                    outcome = Lost(f"its process ended with exit code {worker.process.exitcode}")
+                else:
+                    if isinstance(outcome, Lost):
+                        self._ended(worker)
+                    else:
+                        self._idle.append(worker)
                 yield task, outcome
 
     def _begin(self, task: Any, attempt: int) -> None:
-        worker = self._idle.pop() if self._idle else self._start(self._free.pop())
-        worker.connection.send(task)
+        worker = None
+        while worker is None:
+            worker = self._idle.pop() if self._idle else self._start(self._free.pop())
+            try:
+                worker.connection.send(task)
+            except OSError:  # it was killed while it had nothing to do
+                self._ended(worker)
+                worker = None
         self._busy[worker.connection] = worker, task, attempt
+
+    def _ended(self, worker: _Worker) -> Lost:
+        """Free the place of a process that ends; how it does."""
+        worker.process.join()
+        worker.connection.close()
+        self._free.append(worker.place)
+        return Lost(_how(worker.process.exitcode or 0))
 
     def _start(self, place: Place) -> _Worker:
         ours, theirs = self._context.Pipe()
-        given = theirs, place, self.work
+        given = theirs, place, pickle.dumps(self.work)
         process = self._context.Process(target=_serve, args=given, name="gftorf-worker")
         process.start()
         theirs.close()
@@ -153,7 +171,15 @@ class Workers:
         self._kill()
 
 
-def _serve(connection: Connection, place: Place, work: Callable[[Any, Place], Any]) -> None:
+def _how(exit_code: int) -> str:
+    """How a process ended, by its exit code."""
+    if exit_code >= 0:
+        return f"its process ended with exit code {exit_code}"
+    name = signal.strsignal(-exit_code) or -exit_code
+    return f"its process was ended by a signal ({name}), as when memory is short"
+
+
+def _serve(connection: Connection, place: Place, pickled: bytes) -> None:
     """The life of a process: tasks until its parent closes the connection, or ends."""
     from ..process import sigterm_raises
 
@@ -164,6 +190,12 @@ def _serve(connection: Connection, place: Place, work: Callable[[Any, Place], An
     log.propagate = False
     try:
         with sigterm_raises():
+            try:
+                work = pickle.loads(pickled)  # imports all that it needs
+            except (ImportError, MemoryError, OSError) as error:
+                connection.recv()
+                connection.send(Lost(f"its process could not begin: {error or 'out of memory'}"))
+                return
             while True:
                 connection.send(work(connection.recv(), place))
     except (EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
