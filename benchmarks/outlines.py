@@ -31,7 +31,6 @@ from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
 from gftorf_warp.recon import outlines, phasors
-from gftorf_warp.recon.phasors import MeasuredPhasors
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.sim.random_scene import random_scene
@@ -129,7 +128,7 @@ def score(out: Path, specs: list[str]) -> None:
     for path in sorted(out.glob("*.pt")):
         stored = torch.load(path, weights_only=False)  # a file of our own
         run = stored["open"] = Run.open(stored["run"], "cpu")
-        stored["measured"] = MeasuredPhasors.of(run.sequence(), run.camera, run.field.device)
+        stored["measured"] = run._measured_phasors
         stored["sequence"] = run.config["sequence"]
         groups.setdefault(path.stem.partition("-")[0], []).append(stored)
     constants = {

@@ -206,6 +206,23 @@ def test_a_run_with_the_setting_says_where_its_distance_is_from(runs, tmp_path):
     assert "source" not in read_exr(tmp_path / "plain" / "distance" / "000000.exr")
 
 
+def test_quads_and_phasor_are_those_of_the_measurement_where_it_may_replace_the_fit(runs):
+    """From all ways to render them; elsewhere, without a closed form, they stay between frames."""
+    run, plain, between = runs["with"], runs["without"], 9.4 / FRAME_RATE_HZ
+    given, bare = run.render(between), plain.render(between)
+    may = run.fallback.rests[2] | (given.source == CLOSED_FORM)
+    changed = (given.phasor[:2] != bare.phasor[:2]).any(dim=0)
+    assert float(changed[may].float().mean()) > 0.9
+    torch.testing.assert_close(given.phasor[:2, ~may], bare.phasor[:2, ~may])
+    torch.testing.assert_close(given.quads[:, ~may], bare.quads[:, ~may])
+    quads = run.renderer(("quads",))(between, run.camera).quads
+    torch.testing.assert_close(quads, given.quads)
+    never = torch.zeros_like(run.fallback.rests)
+    fit = Run.open(run.path)
+    fit.__dict__["fallback"] = replace(run.fallback, rests=never, moved=never)
+    torch.testing.assert_close(fit.render(between).phasor[:2], bare.phasor[:2])
+
+
 def test_compare_scores_the_result_and_the_fit_alone(runs):
     """Shares of the sources, and the errors that the run would have without the measurement."""
     got, bare = (compare(runs[name]) for name in ("with", "without"))
@@ -215,6 +232,8 @@ def test_compare_scores_the_result_and_the_fit_alone(runs):
     assert set(got["source"]) == set(SOURCES)
     static = got["static"]
     assert static["d_mse_x100"] < 0.7 * static["d_fit_mse_x100"]
+    assert static["d_tof_mse_x100"] < 0.7 * bare["static"]["d_tof_mse_x100"]
+    assert got["quad_psnr_db"] == pytest.approx(bare["quad_psnr_db"])
     assert static["d_mse_x100"] < 1.2 * static["temporal_mse_x100"]
     assert got["d_mse_x100"] < got["closed_form_mse_x100"]
     page = (runs["with"].path / "report.html").read_text()

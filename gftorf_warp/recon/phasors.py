@@ -97,7 +97,7 @@ class MeasuredPhasors:
     variance: Float[Tensor, "Q H W"]
     """Of each of its components, from the noise [quad units^2]."""
     averaged: Bool[Tensor, "Q H W"]
-    """Where it is a mean of several quartets."""
+    """Where it is a mean of several quartets that may replace what is rendered."""
     of_quads: Float[Tensor, "K H W"]
     """Variance of the quad of every slot, from the noise [quad units^2]."""
 
@@ -178,7 +178,7 @@ class MeasuredPhasors:
         re, im = rendered.value.real, rendered.value.imag
         shift = float(self.sequence.shifts[n])
         measured = torch.as_tensor(self.sequence.quads[n], device=re.device, dtype=re.dtype)
-        residual = 2.0 * (measured - quad_from_phasor(re, im, 0.0, shift))
+        residual = 2.0 * (measured - quad_from_phasor(re, im, torch.zeros_like(re), shift))
         square = residual.square()
         share = _share_of_error(square, 4.0 * self.of_quads[n % self.sequence.cycle])
         along = rendered.variance_re + square.median() / MEDIAN_SQUARE

@@ -204,7 +204,11 @@ class Run(StoredRun):
         is logged.
         """
         try:
-            return MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
+            found = MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
+            if found is None or self.fallback is None:
+                return found
+            # beside what moves, a fit that explains the quads as well as the mean is right
+            return replace(found, averaged=self.fallback.rests)
         except InputError as error:
             LOG.warning("outlines from renderings alone: %s: %s", error.what, error.why)
             return None
