@@ -131,7 +131,7 @@ class CapturedGraph:
         self._ready, self._pool, self._generators = ready, pool, generators
         self._graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, work: Callable[[], None]) -> None:
+    def __call__(self, work: Callable[[], object]) -> None:
         """Replay the graph of ``work``, the same in all calls; the first one captures it."""
         if self._graph is None:
             graph = torch.cuda.CUDAGraph()

@@ -281,7 +281,7 @@ def _row(title: str, given: Any, path: Path) -> Row:
     _check_keys(given, ROW_KEYS, path, f"{where}.")
     for key, value in given.items():
         kind, wanted = ROW_KEYS[key]
-        if type(value) is not kind or (kind is int and value < 1):
+        if type(value) is not kind or (isinstance(value, int) and value < 1):
             raise _wrong(path, f"{where}.{key}", f"expected {wanted}, found {value!r}")
     _check_keys([given["preset"]], presets.PRESETS, path, f"{where}.preset: ")
     changes = tuple(_texts(given.get("changes", []), f"{where}.changes", path))

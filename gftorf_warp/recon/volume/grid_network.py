@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from ...render.hash_grid import Levels, interpolated, levels_of
 from ...scene.encoding import encoded, encoded_size, powers_of_two
-from .network import ALIGNED, FLOW_DEVIATION, Light
+from .network import ALIGNED, Light, reset
 from .settings import GridSettings
 
 FEATURE = 1e-4  # [1] features at the start are uniform up to this, as by Mueller et al.
@@ -115,15 +115,7 @@ class GridNetwork(torch.nn.Module):
         """Glorot's uniform weights; the same density everywhere, and nothing moves."""
         for layer in self.modules():
             if isinstance(layer, torch.nn.Linear):
-                bound = math.sqrt(6.0 / (layer.in_features + layer.out_features))
-                drawn = torch.empty(layer.weight.shape)  # on the CPU, like the generator
-                if layer is self.flow_head:
-                    drawn.normal_(0.0, FLOW_DEVIATION, generator=generator)
-                else:
-                    drawn.uniform_(-bound, bound, generator=generator)
-                layer.weight.copy_(drawn)
-                if layer.bias is not None:
-                    layer.bias.zero_()
+                reset(layer, layer.in_features, generator, still=layer is self.flow_head)
         self.trunk_head.bias[0] = math.log(settings.density)
 
     def trunk(

@@ -93,15 +93,7 @@ class VolumeNetwork(torch.nn.Module):
             layers = [part for part in parts if isinstance(part, torch.nn.Linear)]
             inputs = sum(layer.in_features for layer in layers)
             for layer in layers:
-                bound = math.sqrt(6.0 / (inputs + layer.out_features))
-                drawn = torch.empty(layer.weight.shape)  # on the CPU, like the generator
-                if layer is self.flow_head:
-                    drawn.normal_(0.0, FLOW_DEVIATION, generator=generator)
-                else:
-                    drawn.uniform_(-bound, bound, generator=generator)
-                layer.weight.copy_(drawn)
-                if layer.bias is not None:
-                    layer.bias.zero_()
+                reset(layer, inputs, generator, still=layer is self.flow_head)
 
     def trunk(
         self, points: Float[Tensor, "T P 3"], codes: Float[Tensor, "T C"] | None
@@ -142,6 +134,29 @@ class VolumeNetwork(torch.nn.Module):
         """Displacement to the next quartet and to the one before [m], at most ``reach`` each."""
         found = reach * torch.tanh(self.flow_head(trunk).float())
         return found.unflatten(-1, (2, 3))
+
+
+@torch.no_grad()
+def reset(
+    layer: torch.nn.Linear, inputs: int, generator: torch.Generator, *, still: bool = False
+) -> None:
+    """Glorot's uniform weights and no bias.
+
+    Args:
+        layer: Is changed in place.
+        inputs: Of it and of the layers whose outputs are added to its own.
+        generator: Of random numbers, on the CPU.
+        still: Nearly zero weights instead, of a flow where nothing moves.
+    """
+    bound = math.sqrt(6.0 / (inputs + layer.out_features))
+    drawn = torch.empty(layer.weight.shape)  # on the CPU, like the generator
+    if still:
+        drawn.normal_(0.0, FLOW_DEVIATION, generator=generator)
+    else:
+        drawn.uniform_(-bound, bound, generator=generator)
+    layer.weight.copy_(drawn)
+    if layer.bias is not None:
+        layer.bias.zero_()
 
 
 class TimeCodes(torch.nn.Module):

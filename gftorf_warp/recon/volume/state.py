@@ -14,6 +14,7 @@ from ..state import FORMAT
 from .models import new_volume, volume_from_dict
 from .settings import VolumeSettings
 from .targets import Draw, Targets
+from .volume import Volume
 
 
 class VolumeState:

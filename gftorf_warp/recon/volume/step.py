@@ -20,7 +20,7 @@ from .choice import Given, Inputs
 from .state import VolumeState
 from .targets import Targets
 
-Replayed = Callable[[Callable[[], object]], None]
+Replayed = Callable[[Callable[[], object]], object]
 """Runs a function, the same in all calls, or replays what it did."""
 
 
@@ -58,10 +58,10 @@ class VolumeStep:
         self._parameters = [*state.volume.parameters()]
         self._accumulated = settings.volume.accumulated
         device = state.volume.device
-        if replayed is None:
-            captured = settings.graph and device.type != "cpu"
-            replayed = partial(graph_of, state, graph_pool(device)) if captured else _eager
-        self._replayed = replayed
+        chosen: Callable[[], Replayed] = _eager
+        if settings.graph and device.type != "cpu":
+            chosen = partial(graph_of, state, graph_pool(device))
+        self._replayed = replayed or chosen
         self._known: dict[Hashable, _Known] = {}
 
     def run(self, step: int) -> None:
@@ -119,4 +119,4 @@ def graph_of(state: VolumeState, pool: object) -> CapturedGraph:
 
 
 def _eager() -> Replayed:
-    return lambda work: work() and None
+    return lambda work: work()
