@@ -164,6 +164,8 @@ def test_what_is_assumed_is_named_below_the_table(swept):
     assert "| demo | ftorf * |" in text
     assert "| demo | best |" in text
     assert text.count("\n* ftorf: ") == 2
+    both = table.markdown(plan, found | {"demo/best-0": found["demo/ftorf-0"]})
+    assert "\n* ftorf, best: one guess" in both
     assert "another" in table.html(plan, found, {})
     failed = {"demo/ftorf-0": {"id": "demo/ftorf-0", "error": "none", "exit_code": 2}}
     assert "guess" not in table.markdown(plan, failed)

@@ -32,14 +32,15 @@ class Panel(NamedTuple):
     """Of its colours; None: they are no values."""
 
 
-def captioned(panels: Sequence[Panel], title: str) -> Picture:
+def captioned(panels: Sequence[Panel], title: str, least: int | None = None) -> Picture:
     """Pictures of one height in a row; those of one scale share a colour bar.
 
     Pixels are enlarged to squares, so that colours stay those of the scale. Width and height are
-    even, as video codecs want.
+    even, as video codecs want. ``least`` is the least width of each [px]; None: what suits so many.
     """
     height, width = panels[0].image.shape[:2]
-    factor = max(1, -(-(ALONE if len(panels) == 1 else IN_A_ROW) // width))
+    least = least or (ALONE if len(panels) == 1 else IN_A_ROW)
+    factor = max(1, -(-least // width))
     top = HEAD + (SUBHEAD if any(panel.title for panel in panels) else 0)
     bars = [one.scale != other.scale for one, other in pairwise(panels)] + [True]
     bars = [bar and panel.scale is not None for bar, panel in zip(bars, panels, strict=True)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..evaluate import pictures
-from ..evaluate.captioned import Panel, Picture, captioned
+from ..evaluate.captioned import IN_A_ROW, Panel, Picture, captioned
 from .job import picture_of
 from .plan import Job, Plan, Scene
 
@@ -42,10 +42,10 @@ def sheet(plan: Plan, scene: Scene, out: Path) -> Picture | None:
     for k in range(0, len(names), IN_A_LINE):
         some = names[k : k + IN_A_LINE]
         panels = [_panel(name, distances[name], scale) for name in some]
-        lines.append(captioned(panels, f"{scene.name}: distance [m]"))
+        lines.append(captioned(panels, f"{scene.name}: distance [m]", IN_A_ROW))
         if error_scale is not None:
             panels = [_panel(name, _error(errors, distances, name), error_scale) for name in some]
-            lines.append(captioned(panels, f"{scene.name}: |error| [m]"))
+            lines.append(captioned(panels, f"{scene.name}: |error| [m]", IN_A_ROW))
     return _stacked(lines)
 
 

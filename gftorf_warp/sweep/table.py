@@ -105,16 +105,16 @@ def failures(results: Iterable[Result]) -> list[str]:
     return [f"{result['id']}: {result['error']}" for result in results if "error" in result]
 
 
-def assumptions(plan: Plan, results: Mapping[str, Result]) -> dict[str, list[str]]:
-    """What was not published, or is done in another way, by row; rows that all publish, or nobody
-    does, have none.
+def assumptions(plan: Plan, results: Mapping[str, Result]) -> list[str]:
+    """What was not published, or is done in another way, a line each after the rows that it is said
+    of; of rows that all publish, or nobody does, nothing is.
     """
-    notes: dict[str, list[str]] = {}
+    rows: dict[str, dict[str, None]] = {}
     for job in plan.fits:
-        assumed = results.get(job.id, {}).get("assumed")
-        if job.row is not None and assumed:
-            notes.setdefault(job.row.name, [f"{job.row.name}: {each}" for each in assumed])
-    return notes
+        for sentence in results.get(job.id, {}).get("assumed", ()):
+            if job.row is not None:
+                rows.setdefault(sentence, {})[job.row.name] = None
+    return [f"{', '.join(names)}: {sentence}" for sentence, names in rows.items()]
 
 
 def exit_code(results: Iterable[Result]) -> int:
@@ -129,8 +129,7 @@ def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
     for line in [*lines_of(plan, results), *over_scenes(plan, results)]:
         cells = (line.cells.get(title, NONE) for title in [*COLUMNS, *COSTS])
         text.append(_row([line.scene, line.row, *cells]))
-    for notes in assumptions(plan, results).values():
-        text += ["", *(f"* {note}" for note in notes)]
+    text += ["", *(f"* {note}" for note in assumptions(plan, results))]
     text += [f"\nnot applied: {refusal}" for refusal in refusals(results.values())]
     text += [f"\nfailed: {failure}" for failure in failures(results.values())]
     return "\n".join(text) + "\n"
@@ -154,7 +153,7 @@ def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture
         shown = "" if picture is None else page.plain_picture(picture, scene.name, "all rows")
         body += page.section(page.escape(scene.name), _html(own, [*COLUMNS, *COSTS]), shown)
     if notes := assumptions(plan, results):
-        listed = "".join(f"<li>{page.escape(n)}</li>" for row in notes.values() for n in row)
+        listed = "".join(f"<li>{page.escape(note)}</li>" for note in notes)
         body += page.section("Not as published (*)", f"<ul>{listed}</ul>")
     return page.document("Sweep", body)
 
