@@ -94,9 +94,10 @@ def _verdict(rows: dict[str, Row]) -> int:
     blocks = [row for part, row in rows.items() if part.startswith(("seam ", "inside "))]
     at = {kind: [r for r in blocks if r["part"].startswith(kind)] for kind in ("seam", "inside")}
     if all(at.values()):
-        mean = {kind: float(np.mean([r["error"] for r in found])) for kind, found in at.items()}
-        ratio = mean["seam"] / mean["inside"]
         frames = {kind: sum(r["frames"] for r in found) for kind, found in at.items()}
+        sums = {kind: sum(r["error"] * r["frames"] for r in found) for kind, found in at.items()}
+        mean = {kind: sums[kind] / frames[kind] for kind in at}
+        ratio = mean["seam"] / mean["inside"]
         print(f"errors {mean}, raw frames {frames}; at seams / inside: {ratio:.3f}")
         failed |= ratio > SEAMS
     return int(failed)

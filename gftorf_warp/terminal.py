@@ -27,6 +27,8 @@ OUT_OF_MEMORY = (
     *("can't allocate memory", "Insufficient memory", "std::bad_alloc"),
     *("can't start new thread", "failed to map segment"),
 )
+# of Warp, when the machine code of a kernel is not in memory; no class tells it
+LOST_KERNEL = re.compile(r"Failed to (find (forward|backward) kernel|load CPU module)")
 
 
 class Progress:
@@ -146,6 +148,13 @@ def as_known_error(error: BaseException) -> GftorfError | None:
             where=text.splitlines()[0][:120] if text else "this process",
             why="the arrays of this command do not fit",
             fix="use a smaller --size or fewer --frames, or --device cpu if the GPU is full",
+        )
+    if LOST_KERNEL.match(text):
+        return ResourceError(
+            "a kernel cannot be loaded",
+            where=text.splitlines()[0][:120],
+            why="memory is short, or its file in the kernel cache is damaged",
+            fix="free memory, or remove the folder of kernels that the first line of the log names",
         )
     if not isinstance(error, OSError):
         return None

@@ -1,11 +1,14 @@
 """What a terminal shows while something goes on: progress, and what Warp has to say."""
 
+import errno
 import logging
 import subprocess
 import sys
 
+import pytest
+
 from gftorf_warp import terminal
-from gftorf_warp.errors import InputError
+from gftorf_warp.errors import InputError, ResourceError
 from gftorf_warp.recon.record import log_to
 from gftorf_warp.render.runtime import WarpLog
 
@@ -22,6 +25,25 @@ def test_large_rates_have_plain_digits():
     """81,180 images per second, not 8.118e+04."""
     line = terminal.progress_line("x", 9, 9, 0, 4.0, {"images/s": 81_180.4, "loss": 12.3456})
     assert line == "  x 9/9  images/s 81180  loss 12.35  4.0 s"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("Failed to find backward kernel 'blend' from module 'm' for device 'cpu'"),
+        Exception("Failed to load CPU module 'm' (build)"),
+        RuntimeError("can't start new thread"),
+        ImportError("libtorch.so: failed to map segment from shared object"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+    ],
+    ids=["kernel", "module", "thread", "library", "process"],
+)
+def test_too_little_memory_is_no_bug(error):
+    """Whoever could not have it: exit code 5 and what to do, not the name of an exception."""
+    known = terminal.as_known_error(error)
+    assert isinstance(known, ResourceError)
+    assert "memory" in str(known)
+    assert terminal.as_known_error(RuntimeError("Failed to do something else")) is None
 
 
 def test_endless_paths_are_shortened(capsys):
