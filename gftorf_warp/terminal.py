@@ -22,9 +22,9 @@ WORD_MAX = 240  # characters of a word in a message; a path of several folders h
 LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
 # of Warp's native code; our first line reports it
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
-# of torch, OpenCV, Python's threads, and the loader of libraries
+# of torch, Warp, OpenCV, Python's threads, and the loader of libraries
 OUT_OF_MEMORY = (
-    *("can't allocate memory", "Insufficient memory", "std::bad_alloc"),
+    *("can't allocate memory", "Failed to allocate", "Insufficient memory", "std::bad_alloc"),
     *("can't start new thread", "failed to map segment"),
 )
 # of Warp, when the machine code of a kernel is not in memory; no class tells it

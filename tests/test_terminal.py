@@ -32,11 +32,12 @@ def test_large_rates_have_plain_digits():
     [
         RuntimeError("Failed to find backward kernel 'blend' from module 'm' for device 'cpu'"),
         Exception("Failed to load CPU module 'm' (build)"),
+        RuntimeError("Failed to allocate 2343168 bytes on device 'cpu'"),
         RuntimeError("can't start new thread"),
         ImportError("libtorch.so: failed to map segment from shared object"),
         OSError(errno.ENOMEM, "Cannot allocate memory"),
     ],
-    ids=["kernel", "module", "thread", "library", "process"],
+    ids=["kernel", "module", "array", "thread", "library", "process"],
 )
 def test_too_little_memory_is_no_bug(error):
     """Whoever could not have it: exit code 5 and what to do, not the name of an exception."""
