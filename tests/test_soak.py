@@ -3,7 +3,9 @@ growth that benchmarks/soak.py would not see.
 """
 
 import gc
+import os
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,6 +77,8 @@ def test_growth_is_found_and_noise_is_not():
 def test_a_round_leaves_no_file(tmp_path, monkeypatch):
     """Neither in TMPDIR nor in the working folder, nor in that of the caller."""
     monkeypatch.setattr(soak, "PRESETS", ("temporal",))
+    monkeypatch.setattr(tempfile, "tempdir", tempfile.gettempdir())  # rounds have their own
+    monkeypatch.setenv("TMPDIR", os.environ.get("TMPDIR", tempfile.gettempdir()))
     before = set(Path.cwd().iterdir())
     found = soak.rounds(1.0, 2, tmp_path / "table.csv")
     assert [(state.temporary, state.working) for state in found] == [(0, 0)] * 2
