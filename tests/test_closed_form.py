@@ -11,11 +11,12 @@ from moving_box import recording, with_colour
 
 from gftorf_warp import Sequence
 from gftorf_warp.data.decode import closed_form_distance, quartet_phasor
+from gftorf_warp.data.temporal import nearest_quartet
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
-from gftorf_warp.recon.closed_form import nearest_quartet, quads_of
+from gftorf_warp.recon.closed_form import quads_of
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.runs.closed_form import ClosedForm
 from gftorf_warp.recon.train import reconstruct

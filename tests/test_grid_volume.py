@@ -1,5 +1,6 @@
 """Method ``volume``: where its samples are, what its grids cover, which raw frames it compares."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +11,14 @@ from torch.testing import assert_close
 from volume_steps import terms_of
 
 from gftorf_warp.recon import presets
+from gftorf_warp.recon.folder import differences
 from gftorf_warp.recon.observations import observe, reduced
+from gftorf_warp.recon.settings import plain
 from gftorf_warp.recon.volume import composite
 from gftorf_warp.recon.volume.models import new_volume
 from gftorf_warp.recon.volume.occupancy import Occupancy
 from gftorf_warp.recon.volume.rays import CLOSED
-from gftorf_warp.recon.volume.settings import GridSettings, OccupancySettings
+from gftorf_warp.recon.volume.settings import GridSettings, OccupancySettings, settings_of
 from gftorf_warp.recon.volume.targets import Draw, Targets
 
 CELLS = OccupancySettings(cells=10, update_every=1, warm_up=0, anywhere=0.2)
@@ -197,3 +200,22 @@ def test_its_quads_move_with_time():
     trunk = volume.trunk(points.expand(3, 5, 2, 3), quartets)
     assert_close(trunk[0], trunk[2])
     assert np.abs((trunk[0] - trunk[1]).detach().numpy()).max() > 1e-2
+
+
+def test_runs_of_a_removed_setting_are_read_or_refused():
+    """With the value that is what is done now a run is the same, and goes on; another is refused by
+    name.
+    """
+    settings = plain(presets.volume())
+    assert settings_of(settings["volume"]) == presets.volume().volume
+    for rate in (1.0, 0.1):
+        older = copy.deepcopy(settings)
+        older["volume"]["grid"]["moving_rate"] = rate
+        found = differences({"settings": older}, {"settings": settings})
+        if rate == 1.0:
+            assert settings_of(older["volume"]) == presets.volume().volume
+            assert found == []
+            continue
+        assert found == ["volume.grid.moving_rate was 0.1, now 1.0"]
+        with pytest.raises(ValueError, match=r"moving_rate was removed and is 1 now, found 0\.1"):
+            settings_of(older["volume"])

@@ -138,6 +138,28 @@ def test_the_matcher_is_a_setting(box, tmp_path):
     assert not (tmp_path / "refused").exists()
 
 
+THREE_FREQUENCIES = ("shifts=0,2.0944,4.1888", "f_mod_hz=80e6", "further_hz=16e6,120e6")
+
+
+def test_several_frequencies_do_not_lose_what_rests():
+    """Where slots see different surfaces their phases disagree, and would decode to a distance some
+    metres away: such pixels are as in the closed form.
+    """
+    overrides = tuple(f"sensor.{one}" for one in THREE_FREQUENCIES)
+    settings = SimSettings(format="capture", size=(48, 36), frames=36, overrides=overrides)
+    made = record(SCENES["demo"], settings)
+    sequence, frames = made.sequence, [*range(0, 36, 3)]
+    assert (sequence.cycle, len(sequence.frequencies)) == (9, 3)
+    truth = made.truth.distance[frames]
+    moving, static = moving_and_static(made.truth.distance, frames, from_phasors=False, cycle=9)
+    naive = np.stack([closed_form_distance(sequence, n // 9) for n in frames]) - truth
+    times = [float(sequence.times[n]) for n in frames]
+    ours = np.stack([closed_form_distance(synchronised(sequence, t).sequence, 0) for t in times])
+    ours -= truth
+    assert np.square(ours[moving]).mean() < 0.8 * np.square(naive[moving]).mean()
+    assert np.square(ours[static]).mean() < 1.2 * np.square(naive[static]).mean()
+
+
 def unfit(kind):
     """Recordings that have nothing to synchronise."""
     sequence, _ = recording(frames=8)

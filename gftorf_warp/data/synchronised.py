@@ -20,6 +20,10 @@ nothing: motion along the rays is where this fails.
 Where a recording has the sums of both taps, which have no phase, any two raw frames can be matched.
 Then F and B lead to the raw frame nearest to t, at most a cycle away, and a pixel is moved by the
 share of it that lies between its own time and t.
+
+Where flow is wrong, the slots of a pixel see different surfaces. Of one frequency that is an error
+of centimetres; of several, their phases disagree and may decode to a distance some metres away. So
+a pixel whose phases agree less than those of the nearest quartet keeps what was measured there.
 """
 
 from __future__ import annotations
@@ -32,10 +36,11 @@ from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from . import flow as optical_flow
+from .decode import decode_quartet
 from .flow import Method, compute_flow, flow_between, sample
 from .kept import kept
 from .sequence import Flow, Sequence
-from .temporal import one_quartet
+from .temporal import nearest_quartet, one_quartet
 
 MISMATCH = 20.0  # [1] per brightness range of the image: half a grey level of sixteen costs a half
 COVERED = 1e-3  # [1] weight of pixels of unknown flow: any pixel of known flow outweighs it
@@ -67,8 +72,10 @@ def synchronised(sequence: Sequence, time: float, method: Method = "dis") -> Syn
     first = sequence.complete_quartets[0] * sequence.cycle
     time = float(np.clip(time, sequence.times[0], sequence.times[-1]))
     images = [slot_at(sequence, first + k, time, method) for k in range(sequence.cycle)]
-    nearest = int(np.abs(sequence.times - time).argmin())
     one = one_quartet(sequence, np.stack([image for image, _ in images]), first)
+    if len(sequence.frequencies) > 1:
+        one = _consistent(one, sequence, nearest_quartet(sequence, time))
+    nearest = int(np.abs(sequence.times - time).argmin())
     one = replace(
         one,
         times=np.full(sequence.cycle, time),
@@ -77,6 +84,17 @@ def synchronised(sequence: Sequence, time: float, method: Method = "dis") -> Syn
         ),
     )
     return Synchronised(sequence=one, filled=np.stack([filled for _, filled in images]))
+
+
+def _consistent(one: Sequence, measured: Sequence, quartet: int) -> Sequence:
+    """One quartet of several frequencies with its quads, or those of a measured quartet in pixels
+    whose phases agree better there.
+    """
+    ours, theirs = decode_quartet(one, 0).confidence, decode_quartet(measured, quartet).confidence
+    assert ours is not None, "there are several frequencies"
+    assert theirs is not None, "there are several frequencies"
+    frames = measured.quartet_frames(quartet)
+    return replace(one, quads=np.where(theirs > ours, measured.quads[frames], one.quads))
 
 
 def unfilled_share(sequence: Sequence, method: Method = "dis") -> float:

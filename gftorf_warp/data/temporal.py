@@ -143,6 +143,19 @@ def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np
     return closed_form_distance(one, 0)
 
 
+def nearest_quartet(sequence: Sequence, time: float) -> int:
+    """The complete quartet during which ``time`` [s] lies,
+    else the one that ends or begins nearest to it.
+    """
+
+    def away(quartet: int) -> float:
+        first = sequence.cycle * quartet
+        start, end = sequence.times[first], sequence.times[first + sequence.cycle - 1]
+        return max(float(start - time), float(time - end), 0.0)
+
+    return min(sequence.complete_quartets, key=away)
+
+
 def one_quartet(sequence: Sequence, quads: Float[np.ndarray, "K H W"], first: int) -> Sequence:
     """A sequence of one quartet with other quads; the rest is that of raw frames ``first`` .."""
     frames = slice(first, first + sequence.cycle)

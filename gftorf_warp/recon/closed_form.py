@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..data.decode import decode_quartet, quartet_phasors
 from ..data.sequence import Sequence
-from ..data.temporal import camera_rests
+from ..data.temporal import camera_rests, nearest_quartet
 from ..errors import InputError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
@@ -134,19 +134,6 @@ def checked(sequence: Sequence) -> Sequence:
             fix="check the sequence with `gftorf check`, or record longer",
         )
     return sequence
-
-
-def nearest_quartet(sequence: Sequence, time: float) -> int:
-    """The complete quartet during which ``time`` [s] lies,
-    else the one that ends or begins nearest to it.
-    """
-
-    def away(quartet: int) -> float:
-        first = sequence.cycle * quartet
-        start, end = sequence.times[first], sequence.times[first + sequence.cycle - 1]
-        return max(float(start - time), float(time - end), 0.0)
-
-    return min(sequence.complete_quartets, key=away)
 
 
 def quads_of(

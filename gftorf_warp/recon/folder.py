@@ -75,6 +75,8 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
 MAY_GROW = ("schedule.images", "attempts_max")
 # the last until 0.1.0
 CHANGES_NOTHING = ("render.threads", "schedule.checkpoint_every_s", "graph", "kernels")
+REMOVED = {"volume.grid.moving_rate": 1.0}
+"""Settings that older runs state, by the value that is what is done now."""
 
 
 def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
@@ -90,7 +92,7 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
     if "settings" in old:
         flat_old = {**_flat(plain(ReconSettings(preset=""))), **flat_old}
     for key in sorted({*flat_old, *flat_new}):
-        before, after = flat_old.get(key), flat_new.get(key)
+        before, after = flat_old.get(key), flat_new.get(key, REMOVED.get(key))
         if (
             key in MAY_GROW
             and isinstance(before, int)

@@ -27,6 +27,7 @@ ASSUMED: dict[Method, tuple[str, ...]] = {
         "hidden pixels take the median flow of their image; the publication keeps them as measured",
         "flow of a raw frame is the median over the pairs of all shifts around it, or that of tap "
         "sums",
+        "of several frequencies, a pixel keeps its raw frames where their phases agree better",
     )
 } | {method: kind.assumed for method, kind in VOLUMES.items()}
 """What was not published, or is done in another way."""

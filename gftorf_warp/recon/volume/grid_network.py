@@ -85,7 +85,7 @@ class GridNetwork(torch.nn.Module):
             generator: For the weights, on the CPU.
         """
         super().__init__()
-        self.moving_rate, self.flow_rate = settings.moving_rate, settings.flow_rate
+        self.flow_rate = settings.flow_rate
 
         def grid(levels: int, coarsest: int, growth: float, times: int) -> HashGrid:
             cells = [int(coarsest * growth**k) for k in range(levels)]
@@ -125,7 +125,7 @@ class GridNetwork(torch.nn.Module):
         resting = self.resting(points.flatten(0, 1)[None], self.never).unflatten(
             1, points.shape[:2]
         )[0]
-        features = torch.cat([resting, self.moving_rate * self.moving(points, times)], dim=-1)
+        features = torch.cat([resting, self.moving(points, times)], dim=-1)
         return self.trunk_head(functional.relu(self.hidden(features)))
 
     def density(self, trunk: Float[Tensor, "*n v"]) -> Float[Tensor, "*n"]:

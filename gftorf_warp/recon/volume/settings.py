@@ -116,9 +116,6 @@ class GridSettings:
     """Cells along an axis from one level to the next [1]."""
     flow_growth: float = 1.3
     """The same for the scene flow."""
-    moving_rate: float = 1.0
-    """Factor in front of the features of the grid that every quartet has, by which it learns more
-    slowly than the one that knows no time [1]."""
     flow_rate: float = 0.01
     """Factor in front of the last layer of the scene flow, by which it learns more slowly [1]."""
     rows_log2: int = 19
@@ -224,5 +221,7 @@ def settings_of(stored: dict[str, Any]) -> VolumeSettings:
 def _grid_of(stored: dict[str, Any] | None) -> GridSettings | None:
     if stored is None:
         return None
-    older = {"flow_rate": 1.0, "moving_rate": 1.0}  # of runs that do not state it
-    return GridSettings(**older | stored | {"occupancy": OccupancySettings(**stored["occupancy"])})
+    stored = {"flow_rate": 1.0} | stored  # of runs that do not state it
+    if (rate := stored.pop("moving_rate", 1.0)) != 1.0:
+        raise ValueError(f"grid.moving_rate was removed and is 1 now, found {rate}")
+    return GridSettings(**stored | {"occupancy": OccupancySettings(**stored["occupancy"])})
