@@ -54,7 +54,7 @@ PHASES = {  # functions that begin a phase, by module; those of one name are one
         "novel_views": "colour and novel views",
     },
     "evaluate.compare": {
-        "findings": "errors",
+        "comparison_of": "errors",
         "summary": "errors",
         "write_report": "report",
         "compare": "compare",

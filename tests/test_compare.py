@@ -30,7 +30,7 @@ from gftorf_warp.data.write import write
 from gftorf_warp.errors import DivergedError, InputError, UsageError
 from gftorf_warp.evaluate.compare import (
     compare,
-    findings,
+    comparison_of,
     sequence_title,
     summary,
     truth_statement,
@@ -365,7 +365,7 @@ def test_phasors_are_scored_once(run):
     run.sequence = lambda: phasors
     known = analytic_run.truth().distance
     still = Truth(distance=np.repeat(known[[0, 4, 8]], 4, axis=0), known=np.ones(12, dtype=bool))
-    found = findings(phasors, gather(run, phasors, scored_frames(phasors)), still)
+    found = comparison_of(phasors, gather(run, phasors, scored_frames(phasors)), still)
     assert found.views.frames == [0, 4, 8]
     got = summary(run, found, protocol="all")
     assert got["frames"] == 3

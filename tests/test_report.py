@@ -21,7 +21,7 @@ from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.texts import read_rows
 from gftorf_warp.evaluate import controls, figures, page, panels, pictures, tables
-from gftorf_warp.evaluate.compare import compare, findings, summary
+from gftorf_warp.evaluate.compare import compare, comparison_of, summary
 from gftorf_warp.evaluate.gallery import colour_views, novel_views
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.report import report, verdict
@@ -110,7 +110,7 @@ def look_up(metrics, key):
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    """(folder of the run, metrics.json, page, findings) of the analytic run."""
+    """(folder of the run, metrics.json, page, comparison) of the analytic run."""
     run = AnalyticRun(tmp_path_factory.mktemp("compared"), colour=True)
     run.watched(*((100 * i, 9.0 / i, 0.1 / i) for i in range(1, 6)))
     sequence = with_colour(run.sequence())
@@ -119,7 +119,7 @@ def compared(tmp_path_factory):
     truth = sequence.truth()
     frames = scored_frames(sequence)
     found = replace(
-        findings(sequence, gather(run, sequence, frames), truth),
+        comparison_of(sequence, gather(run, sequence, frames), truth),
         colour=colour_views(run, sequence, frames),
         novel=novel_views(run, sequence),
     )
@@ -197,7 +197,7 @@ def test_a_hostile_name_stays_a_name(compared):
         for i in (1, 2)
     ]
     text = report(
-        title=HOSTILE, metrics=hostile, config=config, log=log, found=found, data_card=HOSTILE
+        title=HOSTILE, metrics=hostile, config=config, log=log, comparison=found, data_card=HOSTILE
     )
     html = Page(text)
     assert "script" not in html.tags
@@ -383,7 +383,7 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
     for both in titles:
         assert {"On static pixels", "Transmittance", "Depth distortion", "Gaussians"} <= both
     assert figures.along_run([]) == []
-    bare = Page(report(title="bare", metrics=metrics, config=run.config, log=[], found=found))
+    bare = Page(report(title="bare", metrics=metrics, config=run.config, log=[], comparison=found))
     assert "Along the run" not in bare.texts
     assert "Along the run" not in bare.images
 
@@ -438,9 +438,9 @@ def test_a_page_about_phasors_shows_phasors(compared):
     """Real and imaginary part instead of four quads, and no word about four instants."""
     run, metrics, _, found = compared
     phasors = as_phasors(found.sequence)
-    seen = findings(phasors, gather(run, phasors, scored_frames(phasors)), None)
+    seen = comparison_of(phasors, gather(run, phasors, scored_frames(phasors)), None)
     config = run.config | {"input": "phasor", "motion": "network"}
-    html = Page(report(title="phasors", metrics=metrics, config=config, log=[], found=seen))
+    html = Page(report(title="phasors", metrics=metrics, config=config, log=[], comparison=seen))
     assert {"real part", "imaginary part", "measured phase"} <= set(html.images)
     assert not [title for title in html.images if title.startswith("raw frame")]
     text = " ".join(html.texts.values())
@@ -472,7 +472,7 @@ def test_without_truth_the_page_still_shows_pictures(compared):
     run, metrics, _, found = compared
     blind = replace(found, judgement=None)
     unknown = summary(run, blind, protocol="all")
-    html = Page(report(title="blind", metrics=unknown, config=run.config, log=[], found=blind))
+    html = Page(report(title="blind", metrics=unknown, config=run.config, log=[], comparison=blind))
     assert {"closed form", "ours, d", "measured quad", "rendered quad"} <= set(html.images)
     assert not [title for title in html.images if "truth" in title or title.startswith("error")]
     assert "not known" in html.texts["Errors"]
@@ -520,9 +520,9 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
         quad_rendered=noise - 4.0,
         quad_measured=noise[::-1] - 4.0,
     )
-    found = findings(
+    found = comparison_of(
         sequence, views, Truth(distance=noise[:, ::-1], known=np.ones(frames, dtype=bool))
     )
-    text = report(title="noise", metrics=compared[1], config={}, log=[], found=found)
+    text = report(title="noise", metrics=compared[1], config={}, log=[], comparison=found)
     assert 1_000_000 < len(text) < 4_000_000
     assert pictures.thinned(np.zeros((240, 641)), page.PICTURE_SIZE_MAX).shape == (80, 214)

@@ -1,4 +1,4 @@
-"""Pictures to look at: enlarged, in a row, under a title, each with its colour bar."""
+"""Pictures for viewing: enlarged, in a row, under a title, each with its colour bar."""
 
 from __future__ import annotations
 

@@ -23,13 +23,13 @@ def caveats(config: Mapping[str, Any], sequence: Sequence, truth: Truth | None) 
         sequence: What the run was made from.
         truth: What it is scored against; None: unknown.
     """
-    found = [
+    sentences = [
         _damaged(config),
         _edited(config),
         _tried_again(config),
         _beyond_range(sequence, truth),
     ]
-    texts = [text for text in found if text]
+    texts = [text for text in sentences if text]
     for text in texts:
         LOG.warning("%s", text)
     return texts

@@ -1,4 +1,4 @@
-"""Errors by what the truth looks like around a pixel: near a step (see data/steps.py) it is *edge*,
+"""Errors by the shape of the truth around a pixel: near a step (see data/steps.py) it is *edge*,
 elsewhere *interior*, which the slope of the truth divides further.
 """
 

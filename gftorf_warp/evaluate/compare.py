@@ -25,7 +25,7 @@ from ..recon import checkpoint, residuals
 from . import classes, gallery, views
 from . import metrics as measure
 from .caveats import caveats
-from .panels import Findings, Judgement
+from .panels import Comparison, Judgement
 from .provenance import fact, method_of, version_of
 from .renders import stated_images
 
@@ -88,12 +88,12 @@ def compare(
 
         run = Run.open(run)
     _refuse_earlier_state(run)
-    result, found = score(
+    result, comparison = score(
         run, truth=truth, frames=frames, against=against, novel=report, progress=progress
     )
     write_json(run.path / "metrics.json", result)
     if report:
-        write_report(run, result, found)
+        write_report(run, result, comparison)
     return result
 
 
@@ -105,7 +105,7 @@ def score(
     against: str = "geometry",
     novel: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[dict[str, Any], Findings]:
+) -> tuple[dict[str, Any], Comparison]:
     """:func:`compare` without files: the content of metrics.json, and its arrays; with novel views
     if they are wanted.
     """
@@ -118,16 +118,16 @@ def score(
     need = resources.to_compare(len(scored), sequence.height * sequence.width)
     resources.require(need, run.path, "score fewer raw frames, --frames ftorf13")
     gathered = views.gather(run, sequence, scored, progress=progress)
-    found = replace(
-        findings(sequence, gathered, known, against=against),
+    comparison = replace(
+        comparison_of(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
         residuals=run.explained,
         novel=gallery.novel_views(run, sequence) if novel else None,
     )
-    residuals.warn(found.residuals)
-    result = summary(run, found, protocol=frames, against=against)
+    residuals.warn(comparison.residuals)
+    result = summary(run, comparison, protocol=frames, against=against)
     result["caveats"] = caveats(run.config, sequence, known)
-    return result, found
+    return result, comparison
 
 
 def _refuse_earlier_state(run: Run) -> None:
@@ -151,15 +151,15 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
     Raises:
         InputError: If ``path`` holds no ground truth, or frames or size differ.
     """
-    found = read_truth(sequence if path is None else read(path))
-    if found is None or not found.known.any():
+    truth = read_truth(sequence if path is None else read(path))
+    if truth is None or not truth.known.any():
         if path is None:
             return None
         why = "--truth was given, but this sequence stores no true distance"
         fix = "leave --truth out, or name a sequence with synthetic_depth/"
         raise InputError("no ground truth", where=path, why=why, fix=fix)
-    if found.distance.shape != sequence.quads.shape:
-        shapes = sequence.quads.shape, found.distance.shape
+    if truth.distance.shape != sequence.quads.shape:
+        shapes = sequence.quads.shape, truth.distance.shape
         expected, got = ("x".join(map(str, shape)) for shape in shapes)
         where, why = (
             path or sequence.path,
@@ -169,19 +169,19 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
         raise InputError(
             "the truth does not fit the run", where=where or "sequence", why=why, fix=fix
         )
-    return found
+    return truth
 
 
-def findings(
+def comparison_of(
     sequence: Sequence, gathered: views.Views, truth: Truth | None, *, against: str = AGAINST[0]
-) -> Findings:
+) -> Comparison:
     """Views with their errors if there is a truth.
 
     Raises:
         InputError: If ``against`` is static-phasor and the truth has no such distance.
     """
     if truth is None:
-        return Findings(sequence=sequence, views=gathered, judgement=None)
+        return Comparison(sequence=sequence, views=gathered, judgement=None)
     distance = known_distance(truth)
     moving, static = moving_and_static(
         distance, gathered.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
@@ -193,7 +193,7 @@ def findings(
     errors = {name: measure.squared_error(image, scored) for name, image in images}
     groups = {"moving": moving, "static": static, "throughout": throughout}
     judgement = Judgement(truth=scored, errors=errors, **groups)
-    return Findings(sequence=sequence, views=gathered, judgement=judgement)
+    return Comparison(sequence=sequence, views=gathered, judgement=judgement)
 
 
 def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W"]:
@@ -210,20 +210,20 @@ def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W
 
 
 def summary(
-    run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]
+    run: Run, comparison: Comparison, *, protocol: str, against: str = AGAINST[0]
 ) -> dict[str, Any]:
     """The content of metrics.json: numbers, texts and None."""
-    views, confidence, colour = found.views, found.views.confidence, found.colour
-    peak = float(np.abs(found.sequence.quads[found.sequence.measured]).max())
+    views, confidence, colour = comparison.views, comparison.views.confidence, comparison.colour
+    peak = float(np.abs(comparison.sequence.quads[comparison.sequence.measured]).max())
     return {
         "frames": len(views.frames),
         "protocol": protocol,
         "against": against,
-        **_errors(found.judgement),
-        "unambiguous_range_m": unambiguous_range(found.sequence),
+        **_errors(comparison.judgement),
+        "unambiguous_range_m": unambiguous_range(comparison.sequence),
         "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
         "source": views.source_shares,
-        "explained": found.residuals and found.residuals.as_json(),
+        "explained": comparison.residuals and comparison.residuals.as_json(),
         "quad_psnr_db": measure.psnr_db(views.quad_rendered, views.quad_measured, peak),
         "colour_psnr_db": colour
         and measure.psnr_db(colour.rendered, colour.measured, peak=float(colour.measured.max())),
@@ -260,21 +260,21 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
     }
 
 
-def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
+def write_report(run: Run, result: dict[str, Any], comparison: Comparison) -> Path:
     """Write ``RUN/report.html``."""
     from . import report
 
     path = run.path / "report.html"
     page = report.report(
-        title=sequence_title(found.sequence.path) or run.path.name,
+        title=sequence_title(comparison.sequence.path) or run.path.name,
         metrics=result,
         config=run.config,
         log=read_rows(run.path / "metrics.jsonl"),
         diagnostics=read_rows(run.path / "diagnostics.jsonl"),
-        found=found,
+        comparison=comparison,
         installed=installed_versions(),
-        data_card=truth_statement(found.sequence.path),
-        simulated=simulate_command(found.sequence.path),
+        data_card=truth_statement(comparison.sequence.path),
+        simulated=simulate_command(comparison.sequence.path),
     )
     atomic_write(path, page.encode("utf-8"))
     return path

@@ -90,17 +90,17 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
     """
     if not run.has_colour:  # a closed form has no other view either
         return None
-    found = []
+    triples = []
     for n in (n for n in frames if n in sequence.colour.images):
         camera = colour_camera_of(sequence, n)
         rendered = None if camera is None else run.render(float(sequence.times[n]), camera).colour
         if rendered is None:
             return None
         image = finite(rendered, f"colour of raw frame {n}", run)
-        found.append((n, sequence.colour.images[n], image.transpose(1, 2, 0)))
-    if not found:
+        triples.append((n, sequence.colour.images[n], image.transpose(1, 2, 0)))
+    if not triples:
         return None
-    chosen, measured, images = zip(*found, strict=True)
+    chosen, measured, images = zip(*triples, strict=True)
     return Colour(frames=list(chosen), measured=np.stack(measured), rendered=np.stack(images))
 
 

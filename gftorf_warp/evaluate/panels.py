@@ -56,7 +56,7 @@ class Judgement:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Findings:
+class Comparison:
     """The arrays of a comparison, from which a report is drawn."""
 
     sequence: Sequence
@@ -80,27 +80,27 @@ class Findings:
         return pictures.distance_scale([self.judgement.truth])
 
 
-def telling_row(found: Findings) -> int:
+def telling_row(comparison: Comparison) -> int:
     """The row of the frame to show: in the middle half, the one with most moving pixels.
 
     Without ground truth, motion is estimated by the change between quads of one shift.
     """
-    count = len(found.views.frames)
+    count = len(comparison.views.frames)
     middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
 
     def telling(s: int) -> tuple[float, float]:
-        if found.judgement is None:
-            changed = _change(found.sequence, found.views.frames[s])
+        if comparison.judgement is None:
+            changed = _change(comparison.sequence, comparison.views.frames[s])
         else:
-            changed = float(found.judgement.moving[s].sum())
+            changed = float(comparison.judgement.moving[s].sum())
         return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
     return max(middle, key=telling)
 
 
-def measured_quartet(found: Findings, s: int) -> str:
+def measured_quartet(comparison: Comparison, s: int) -> str:
     """The quads of the quartet, or the phasor, and the decoded images."""
-    sequence, frame = found.sequence, found.views.frames[s]
+    sequence, frame = comparison.sequence, comparison.views.frames[s]
     quartet = frame // sequence.cycle
     re, im = quartet_phasor(sequence, quartet)
     if sequence.from_phasors:
@@ -118,24 +118,24 @@ def measured_quartet(found: Findings, s: int) -> str:
                 note += f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz"
             measured.append(page.picture(sequence.quads[n], scale, f"raw frame {n}", note))
     phase, amplitude = np.arctan2(im, re) % (2.0 * np.pi), np.hypot(re, im)
-    closed_form, grey = found.views.closed_form[s], pictures.amplitude_scale([amplitude])
+    closed_form, grey = comparison.views.closed_form[s], pictures.amplitude_scale([amplitude])
     decoded = [
         page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
         page.picture(amplitude, grey, "measured amplitude", "of the phasor"),
-        page.picture(closed_form, found.distance_scale, "closed form", "phase as distance"),
+        page.picture(closed_form, comparison.distance_scale, "closed form", "phase as distance"),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
-    figures = [*measured, *decoded, *_by_frequency(found, s), text]
+    figures = [*measured, *decoded, *_by_frequency(comparison, s), text]
     return "".join(page.row(figures[k : k + 4], columns=4) for k in range(0, len(figures), 4))
 
 
-def _by_frequency(found: Findings, s: int) -> list[str]:
+def _by_frequency(comparison: Comparison, s: int) -> list[str]:
     """Distances decoded from each of several frequencies alone, and their agreement."""
-    views = found.views
+    views = comparison.views
     if views.single is None or views.confidence is None:
         return []
     figures = []
-    for f, image in zip(found.sequence.frequencies, views.single[s], strict=True):
+    for f, image in zip(comparison.sequence.frequencies, views.single[s], strict=True):
         reach = SPEED_OF_LIGHT / (2.0 * f)
         scale = pictures.Scale(low=0.0, high=reach, colours="viridis", unit="m")
         note = f"wraps at {reach:.3g} m"
@@ -145,11 +145,14 @@ def _by_frequency(found: Findings, s: int) -> list[str]:
     return [*figures, page.picture(views.confidence[s], _share_scale(1.0), title, note)]
 
 
-def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
+def distances(comparison: Comparison, s: int, window: Window = WHOLE) -> str:
     """Closed form, ours and truth, on one scale."""
-    scale = found.distance_scale
+    scale = comparison.distance_scale
     return page.row(
-        [page.picture(image[window], scale, title) for title, image in _distances(found, s).items()]
+        [
+            page.picture(image[window], scale, title)
+            for title, image in _distances(comparison, s).items()
+        ]
     )
 
 
@@ -173,7 +176,7 @@ def error_scale(judged: Judgement, s: int) -> pictures.Scale:
     return pictures.error_scale([error[moving] if moving.any() else error])
 
 
-def close_up(found: Findings, judged: Judgement, s: int) -> str:
+def close_up(comparison: Comparison, judged: Judgement, s: int) -> str:
     """Distances and errors around the moving pixels; empty if that is most of the image."""
     moving = judged.moving[s]
     if not moving.any():
@@ -181,17 +184,17 @@ def close_up(found: Findings, judged: Judgement, s: int) -> str:
     window = _window(moving)
     if moving[window].size > CLOSE_UP_SHARE_MAX * moving.size:
         return ""
-    return distances(found, s, window) + error_maps(judged, s, window)
+    return distances(comparison, s, window) + error_maps(judged, s, window)
 
 
-def quad_residual(found: Findings, s: int) -> str:
+def quad_residual(comparison: Comparison, s: int) -> str:
     """The quad of the frame: measured, rendered and the residual."""
-    measured, rendered = found.views.quad_measured[s], found.views.quad_rendered[s]
-    residual, left = measured - rendered, 1.0 - found.views.opacity[s]
+    measured, rendered = comparison.views.quad_measured[s], comparison.views.quad_rendered[s]
+    residual, left = measured - rendered, 1.0 - comparison.views.opacity[s]
     scale, finer = (pictures.signed_scale([image]) for image in (measured, residual))
     share = _share_scale(max(0.01, float(left.max())))
     figures = [
-        page.picture(measured, scale, "measured quad", f"raw frame {found.views.frames[s]}"),
+        page.picture(measured, scale, "measured quad", f"raw frame {comparison.views.frames[s]}"),
         page.picture(rendered, scale, "rendered quad", "same time and shift"),
         page.picture(residual, finer, "measured minus rendered", "its own scale"),
         page.picture(left, share, "transmittance", "1 \N{MINUS SIGN} opacity"),
@@ -199,17 +202,19 @@ def quad_residual(found: Findings, s: int) -> str:
     return page.row(figures)
 
 
-def explained(found: Findings, s: int) -> str:
+def explained(comparison: Comparison, s: int) -> str:
     """Where the quads are explained: chi-square of the quartet, and how often each pixel is not."""
-    if found.residuals is None:
+    if comparison.residuals is None:
         return ""
-    of_quartet = found.residuals.quartets.index(found.views.frames[s] // found.sequence.cycle)
+    of_quartet = comparison.residuals.quartets.index(
+        comparison.views.frames[s] // comparison.sequence.cycle
+    )
     maps = []
-    if found.residuals.noisy:
-        values = found.residuals.chi_square
+    if comparison.residuals.noisy:
+        values = comparison.residuals.chi_square
         maps.append(chi_square(values[of_quartet], "chi-square", "of this quartet"))
         maps.append(chi_square(values.max(axis=0), "chi-square", "largest of all quartets"))
-    often = found.residuals.unexplained.mean(axis=0, dtype=np.float32)
+    often = comparison.residuals.unexplained.mean(axis=0, dtype=np.float32)
     title = "share of quartets that are not explained"
     return page.row([*maps, page.picture(often, _share_scale(1.0), title)], columns=4)
 
@@ -222,7 +227,7 @@ def chi_square(values: Float[np.ndarray, "H W"], title: str, note: str = "") -> 
 
 
 def error_charts(
-    found: Findings,
+    comparison: Comparison,
     judged: Judgement,
     errors: Mapping[str, Float[np.ndarray, "S H W"]],
     styles: figures.Styles = figures.OF_DISTANCES,
@@ -231,7 +236,7 @@ def error_charts(
     pixels.
 
     Args:
-        found: Whose frames they are.
+        comparison: Whose frames they are.
         judged: What moves.
         errors: Squared errors [m^2] by the names of ``styles``.
         styles: Colour and label of each curve.
@@ -248,7 +253,7 @@ def error_charts(
     }
     return {
         "Error of every raw frame": figures.error_over_frames(
-            found.views.frames, per_frame, styles
+            comparison.views.frames, per_frame, styles
         ),
         "Distribution of errors (the first bin holds all below a millimetre)": (
             figures.error_histogram(errors, groups, styles)
@@ -256,41 +261,41 @@ def error_charts(
     }
 
 
-def source(found: Findings, s: int) -> str:
+def source(comparison: Comparison, s: int) -> str:
     """Where the distance of every pixel is from, and the fit alone."""
-    if found.views.source is None or found.views.d_fit is None:
+    if comparison.views.source is None or comparison.views.d_fit is None:
         return ""
     scale = pictures.Scale(low=0.0, high=len(SOURCE_NAMES) - 1.0, colours="gray", unit="")
-    image, note = found.views.source[s].astype(np.float32), ", ".join(SOURCE_NAMES.values())
-    alone = page.picture(found.views.d_fit[s], found.distance_scale, "the fit alone, d")
+    image, note = comparison.views.source[s].astype(np.float32), ", ".join(SOURCE_NAMES.values())
+    alone = page.picture(comparison.views.d_fit[s], comparison.distance_scale, "the fit alone, d")
     picture = page.picture(image, scale, "source", f"black to white: {note}")
     return page.row([picture, alone], columns=4)
 
 
-def strip_over_time(found: Findings) -> str:
+def strip_over_time(comparison: Comparison) -> str:
     """Distances at a few frames, one row each, on one scale."""
-    count = len(found.views.frames)
+    count = len(comparison.views.frames)
     chosen = sorted({round(x) for x in np.linspace(0, count - 1, STRIP_FRAMES)})
-    scale = found.distance_scale
+    scale = comparison.distance_scale
     rows = []
-    for title in (name for name in _distances(found, 0) if name != TITLES["d_tof"]):
+    for title in (name for name in _distances(comparison, 0) if name != TITLES["d_tof"]):
         figures = []
         for s in chosen:
-            rgb = _small(_distances(found, s)[title], scale)
-            figures.append(page.plain_picture(rgb, title, f"frame {found.views.frames[s]}"))
+            rgb = _small(_distances(comparison, s)[title], scale)
+            figures.append(page.plain_picture(rgb, title, f"frame {comparison.views.frames[s]}"))
         rows.append(page.row(figures, kind="strip"))
     return "".join(rows) + f'<div class="wide">{page.colour_bar(scale)}</div>'
 
 
-def film(found: Findings, shown: Mapping[str, tuple[np.ndarray, pictures.Scale]]) -> str:
+def film(comparison: Comparison, shown: Mapping[str, tuple[np.ndarray, pictures.Scale]]) -> str:
     """The first frames of all quartets; empty if there is one only.
 
     Args:
-        found: Whose frames they are.
+        comparison: Whose frames they are.
         shown: By title, the images [S, H, W] of all scored frames, and their scale.
     """
-    cycle = found.sequence.cycle
-    starts = [s for s, n in enumerate(found.views.frames) if n % cycle == 0]
+    cycle = comparison.sequence.cycle
+    starts = [s for s, n in enumerate(comparison.views.frames) if n % cycle == 0]
     starts = starts[:: -(-len(starts) // FILM_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
@@ -303,28 +308,32 @@ def film(found: Findings, shown: Mapping[str, tuple[np.ndarray, pictures.Scale]]
     )
 
 
-def film_of_run(found: Findings) -> str:
+def film_of_run(comparison: Comparison) -> str:
     """A film of the measured quad, closed form and ours, and of the truth if known."""
-    views = found.views
-    quad, metres = pictures.signed_scale([views.quad_measured]), found.distance_scale
+    views = comparison.views
+    quad, metres = pictures.signed_scale([views.quad_measured]), comparison.distance_scale
     shown = {
         "measured quad": (views.quad_measured, quad),
         TITLES["closed_form"]: (views.closed_form, metres),
         TITLES["d"]: (views.d, metres),
     }
-    if found.judgement is None:
+    if comparison.judgement is None:
         shown["rendered quad"] = views.quad_rendered, quad
     else:
-        shown["truth"] = found.judgement.truth, metres
-    return film(found, shown)
+        shown["truth"] = comparison.judgement.truth, metres
+    return film(comparison, shown)
 
 
-def sliders(found: Findings, s: int) -> str:
+def sliders(comparison: Comparison, s: int) -> str:
     """Closed form against ours: their distances, and their errors, or without truth the measured
     quad against the rendered one.
     """
-    views, judged, titles = found.views, found.judgement, (TITLES["closed_form"], TITLES["d"])
-    pairs = [(views.closed_form[s], views.d[s], found.distance_scale, titles)]
+    views, judged, titles = (
+        comparison.views,
+        comparison.judgement,
+        (TITLES["closed_form"], TITLES["d"]),
+    )
+    pairs = [(views.closed_form[s], views.d[s], comparison.distance_scale, titles)]
     if judged is None:
         measured, rendered = views.quad_measured[s], views.quad_rendered[s]
         quads = pictures.signed_scale([measured])
@@ -348,9 +357,9 @@ def slider(
     return controls.slider(rgb[0], rgb[1], titles, bar)
 
 
-def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
+def _distances(comparison: Comparison, s: int) -> dict[str, np.ndarray]:
     """Images [m] by title: closed form, ours, and truth if known."""
-    views, judged = found.views, found.judgement
+    views, judged = comparison.views, comparison.judgement
     images = {title: getattr(views, name)[s] for name, title in TITLES.items()}
     return images if judged is None else images | {"truth": judged.truth[s]}
 

@@ -71,15 +71,15 @@ class _Axis(NamedTuple):
         every = -(-len(decades) // (LABELS + 2))
         decimal = self.high / self.low < 100.0
         labelled = (1, 2, 5) if self.high / self.low > 5.0 else range(1, 10)
-        found = []
+        ticks = []
         for decade in decades:
             power = f"10{str(decade).translate(SUPERSCRIPT)}" if decade % every == 0 else ""
             for k in range(1, 10):
                 value, label = k * 10.0**decade, power if k == 1 else ""
                 if decimal:
                     label = f"{value:g}" if k in labelled else ""
-                found.append((value, label))
-        return [(value, label) for value, label in found if self.low <= value <= self.high]
+                ticks.append((value, label))
+        return [(value, label) for value, label in ticks if self.low <= value <= self.high]
 
 
 def svg(plot: Plot) -> bytes:

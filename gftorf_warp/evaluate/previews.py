@@ -81,13 +81,15 @@ def picture(
     images: Mapping[str, Channels], scales: Mapping[str, pictures.Scale], title: str
 ) -> UInt8[np.ndarray, "h w 3"]:
     """All kinds of images at one time in a row, with titles and colour bars."""
-    found = {name: panels(name, channels, scales[name]) for name, channels in images.items()}
-    if len(found) == 1:
-        name, row = found.popitem()
+    panels_by_name = {
+        name: panels(name, channels, scales[name]) for name, channels in images.items()
+    }
+    if len(panels_by_name) == 1:
+        name, row = panels_by_name.popitem()
         return captioned(row, f"{TITLES[name]}, {title}")
     row = [
         panel._replace(title=", ".join(filter(None, [TITLES[name], panel.title])))
-        for name, several in found.items()
+        for name, several in panels_by_name.items()
         for panel in several
     ]
     return captioned(row, title)

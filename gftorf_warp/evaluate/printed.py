@@ -17,8 +17,8 @@ def table(metrics: dict) -> str:
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']})"
     lines.append(f"{scored}, against {metrics.get('against', 'geometry')}, quad PSNR {quality}")
-    if (found := metrics.get("explained")) is not None:
-        lines.append(_explained(found))
+    if (explained := metrics.get("explained")) is not None:
+        lines.append(_explained(explained))
     share = metrics.get("ambiguous_share")
     if share is not None:
         reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"
@@ -26,7 +26,7 @@ def table(metrics: dict) -> str:
     return "\n".join(lines)
 
 
-def _explained(found: dict) -> str:
+def _explained(explained: dict) -> str:
     """How well the quads are explained, in a line."""
     known = {
         "reduced chi-square of the quads": ("reduced_chi_square", "{:.3g}"),
@@ -34,7 +34,7 @@ def _explained(found: dict) -> str:
         "of those that change": ("changing_unexplained_share", "{:.1%}"),
         "of the others at a wrong distance": ("contradicted_share", "{:.1%}"),
     }
-    values = {name: (found[key], form) for name, (key, form) in known.items()}
+    values = {name: (explained[key], form) for name, (key, form) in known.items()}
     return ", ".join(
         f"{name} {form.format(v)}" for name, (v, form) in values.items() if v is not None
     )

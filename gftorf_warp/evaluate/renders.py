@@ -88,8 +88,8 @@ def prepare_folder(out: Path, listed: Mapping[str, Any], *, fresh: bool) -> None
     fix = "choose another --out"
     if out.exists() and not out.is_dir():
         raise UsageError("not a folder", where=out, why="--out names a file", fix=fix)
-    found = out.iterdir() if out.exists() else ()
-    held = [path for path in found if not path.name.startswith("old-")]
+    entries = out.iterdir() if out.exists() else ()
+    held = [path for path in entries if not path.name.startswith("old-")]
     later = stated_images(out / LIST) > (listed.get("images_optimised") or 0)
     if held and (later or not _same(out / LIST, listed)):
         ours = (out / LIST).is_file()
@@ -114,14 +114,14 @@ def stated_images(path: Path) -> int:
 
 def _same(path: Path, listed: Mapping[str, object]) -> bool:
     """Whether an earlier list names the same run, times, poses and channels."""
-    found = _listed(path)
-    return bool(found) and all(found.get(key) == listed.get(key) for key in LISTED)
+    stored = _listed(path)
+    return bool(stored) and all(stored.get(key) == listed.get(key) for key in LISTED)
 
 
 def _listed(path: Path) -> dict[str, Any]:
     """Content of a list; empty if there is none that can be read."""
     try:
-        found = read_json(path)
+        content = read_json(path)
     except InputError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

@@ -12,7 +12,7 @@ from ..recon.residuals import problems
 from ..render.buffers import available_threads
 from . import figures, gallery, page, panels, provenance, tables
 from .legend import PHASORS_TO_READ, TO_READ
-from .panels import Findings
+from .panels import Comparison
 
 WITHOUT_GAUSSIANS = {
     "ctof": "the closed form itself",
@@ -33,7 +33,7 @@ def report(
     metrics: Mapping[str, Any],
     config: Mapping[str, Any],
     log: Sequence[Mapping[str, float]],
-    found: Findings,
+    comparison: Comparison,
     diagnostics: Sequence[Mapping[str, float]] = (),
     installed: str = "",
     data_card: str | None = None,
@@ -46,30 +46,30 @@ def report(
     of the comparison, ``data_card`` the statement on the truth in the sequence's README, and
     ``simulated`` the command there that made it.
     """
-    s = panels.telling_row(found)
+    s = panels.telling_row(comparison)
     with ThreadPoolExecutor(available_threads()) as pool:  # pictures are encoded without the GIL
-        distances = pool.submit(_distance_pictures, found, s)
-        measured = pool.submit(panels.measured_quartet, found, s)
-        residual = pool.submit(panels.quad_residual, found, s)
-        explained = pool.submit(_explained, metrics, found, s)
-        sliders = pool.submit(panels.sliders, found, s)
-        film = pool.submit(panels.film_of_run, found)
-        strip = pool.submit(panels.strip_over_time, found)
-        beyond = pool.submit(_beyond, metrics, found)
-        curves = pool.submit(_curves, found, log)
-    about_phasors = PHASORS_TO_READ if found.sequence.from_phasors else ""
+        distances = pool.submit(_distance_pictures, comparison, s)
+        measured = pool.submit(panels.measured_quartet, comparison, s)
+        residual = pool.submit(panels.quad_residual, comparison, s)
+        explained = pool.submit(_explained, metrics, comparison, s)
+        sliders = pool.submit(panels.sliders, comparison, s)
+        film = pool.submit(panels.film_of_run, comparison)
+        strip = pool.submit(panels.strip_over_time, comparison)
+        beyond = pool.submit(_beyond, metrics, comparison)
+        curves = pool.submit(_curves, comparison, log)
+    about_phasors = PHASORS_TO_READ if comparison.sequence.from_phasors else ""
     made = provenance.how(config, data_card, installed, compared=metrics, simulated=simulated)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
-        page.section("Before and after", _sliders_text(found, s), sliders.result()),
+        page.section("Before and after", _sliders_text(comparison, s), sliders.result()),
         *_film(film.result()),
         page.section("Errors", tables.errors(metrics), tables.facts(metrics)),
         *_by_class(metrics),
-        page.section("Distance", _distance_text(found, s), distances.result()),
-        page.section("What was measured", _measured_text(found, s), measured.result()),
-        page.section("Quads", _quad_text(found, s), residual.result()),
+        page.section("Distance", _distance_text(comparison, s), distances.result()),
+        page.section("What was measured", _measured_text(comparison, s), measured.result()),
+        page.section("Quads", _quad_text(comparison, s), residual.result()),
         *explained.result(),
         page.section("Over time", strip.result()),
         *beyond.result(),
@@ -147,8 +147,8 @@ def _by_class(metrics: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _sliders_text(found: Findings, s: int) -> str:
-    frame = found.views.frames[s]
+def _sliders_text(comparison: Comparison, s: int) -> str:
+    frame = comparison.views.frames[s]
     return page.caption(
         f"Raw frame {frame}: the closed form, as a camera computes it, and ours. The scroll bar, a "
         "swipe or the arrow keys move the edge."
@@ -161,18 +161,18 @@ def _film(html: str) -> list[str]:
     return [page.section("Quartet by quartet", page.caption(text), html)] if html else []
 
 
-def _distance_text(found: Findings, s: int) -> str:
+def _distance_text(comparison: Comparison, s: int) -> str:
     reason, scale = "most moving pixels", "the truth's"
-    if found.judgement is None:
+    if comparison.judgement is None:
         reason, scale = "the largest change of quads", "one"
     return page.caption(
-        f"Distance along the ray, on {scale} scale, of raw frame {found.views.frames[s]}: the one "
-        f"with {reason} in the middle half of the sequence."
+        f"Distance along the ray, on {scale} scale, of raw frame {comparison.views.frames[s]}: the "
+        f"one with {reason} in the middle half of the sequence."
     )
 
 
-def _measured_text(found: Findings, s: int) -> str:
-    frame, sequence = found.views.frames[s], found.sequence
+def _measured_text(comparison: Comparison, s: int) -> str:
+    frame, sequence = comparison.views.frames[s], comparison.sequence
     if sequence.from_phasors:
         return page.caption(f"The phasor of raw frame {frame}. Red is positive, blue negative.")
     count = COUNTED.get(sequence.cycle, str(sequence.cycle))
@@ -184,22 +184,22 @@ def _measured_text(found: Findings, s: int) -> str:
     )
 
 
-def _distance_pictures(found: Findings, s: int) -> str:
-    html = panels.distances(found, s)
-    if found.judgement is None:
+def _distance_pictures(comparison: Comparison, s: int) -> str:
+    html = panels.distances(comparison, s)
+    if comparison.judgement is None:
         return html
-    html += f"<h3>Absolute error</h3>{panels.error_maps(found.judgement, s)}"
+    html += f"<h3>Absolute error</h3>{panels.error_maps(comparison.judgement, s)}"
     html += page.caption(
         "One scale for all three, defined by the errors of the closed form on moving pixels; "
         "larger errors are clamped."
     )
-    close_up = panels.close_up(found, found.judgement, s)
+    close_up = panels.close_up(comparison, comparison.judgement, s)
     return html + (f"<h3>Close-up of moving pixels</h3>{close_up}" if close_up else "")
 
 
-def _quad_text(found: Findings, s: int) -> str:
-    which = f"The quad of raw frame {found.views.frames[s]}"
-    if found.sequence.from_phasors:
+def _quad_text(comparison: Comparison, s: int) -> str:
+    which = f"The quad of raw frame {comparison.views.frames[s]}"
+    if comparison.sequence.from_phasors:
         which = "The quad of shift zero, half the real part of the phasor"
     return page.caption(
         f"{which}, measured and rendered at its time and pose over a black background; the "
@@ -207,7 +207,7 @@ def _quad_text(found: Findings, s: int) -> str:
     )
 
 
-def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]:
+def _explained(metrics: Mapping[str, Any], comparison: Comparison, s: int) -> list[str]:
     """The section on how well the quads are explained; none if they were not fitted."""
     if page.look_up(metrics, "explained") is None:
         return []
@@ -223,31 +223,31 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
         wrong = page.number(metrics, "explained.contradicted_share", "percent")
         text += f"; of those that do not, {wrong} are far from the distance of their temporal mean"
     text = page.caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
-    html = panels.explained(found, s)
+    html = panels.explained(comparison, s)
     if page.look_up(metrics, "source") is not None:
         shares = [
             f"{name} {page.number(metrics, f'source.{key}', 'percent')}"
             for key, name in panels.SOURCE_NAMES.items()
         ]
         html += page.caption(f"Where our distance is from: {', '.join(shares)}.") + panels.source(
-            found, s
+            comparison, s
         )
     return [page.section("How well the quads are explained", text, html)]
 
 
-def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
+def _beyond(metrics: Mapping[str, Any], comparison: Comparison) -> list[str]:
     """Sections of colour and of novel views, where there are any."""
     sections = []
-    if found.colour is not None:
+    if comparison.colour is not None:
         psnr = page.number(metrics, "colour_psnr_db", "decibel")
         text = f"From the colour camera, at the time of the raw frame. Its PSNR is {psnr}."
         sections.append(
-            page.section("Colour", page.caption(text), gallery.colour_strip(found.colour))
+            page.section("Colour", page.caption(text), gallery.colour_strip(comparison.colour))
         )
-    if found.novel is not None:
+    if comparison.novel is not None:
         text = "The reconstruction in the middle of the sequence, from its novel poses."
         text = page.caption(f"{text} Grey: opacity below one half.")
-        strip = gallery.novel_strip(found.novel, found.distance_scale)
+        strip = gallery.novel_strip(comparison.novel, comparison.distance_scale)
         sections.append(page.section("Novel views", text, strip))
     return sections
 
@@ -281,12 +281,12 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
     ]
 
 
-def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
+def _curves(comparison: Comparison, log: Sequence[Mapping[str, float]]) -> str:
     charts = []
     training = figures.training_curves(log)
     if training:
         charts.append(("During optimisation", training))
-    if found.judgement is not None:
-        errors = {name: found.judgement.errors[name] for name in panels.TITLES}
-        charts += panels.error_charts(found, found.judgement, errors).items()
+    if comparison.judgement is not None:
+        errors = {name: comparison.judgement.errors[name] for name in panels.TITLES}
+        charts += panels.error_charts(comparison, comparison.judgement, errors).items()
     return "".join(f"<h3>{title}</h3>{page.charts(drawings, title)}" for title, drawings in charts)

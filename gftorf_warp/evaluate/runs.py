@@ -13,7 +13,7 @@ from ..data.files import atomic_write, write_json
 from ..errors import InputError, UsageError
 from . import page, panels, runs_page
 from .compare import score, sequence_title
-from .panels import Findings
+from .panels import Comparison
 from .runs_page import Scored
 
 if TYPE_CHECKING:
@@ -60,11 +60,11 @@ def compare_runs(
     check_same_data(runs)
     scored, first = [], None
     for k, run in enumerate(runs):
-        metrics, found = score(
+        metrics, comparison = score(
             run, truth=truth, frames=frames, against=against, progress=_of_all(progress, k, runs)
         )
-        first = first or found
-        scored.append(_scored(names[k], run.config, metrics, found))
+        first = first or comparison
+        scored.append(_scored(names[k], run.config, metrics, comparison))
     assert first is not None, "there are runs"
     path, config = first.sequence.path, runs[0].config
     result = {
@@ -108,14 +108,14 @@ def check_same_data(runs: Sequence[Run]) -> None:
     """
     first, *others = runs
     for run in others:
-        wanted, found = (one.config.get("data_sha256") for one in (first, run))
-        if wanted is None or found is None:  # runs of before 0.1.0
-            wanted, found = (_folder_of(one) for one in (first, run))
-        if wanted == found:
+        first_data, run_data = (one.config.get("data_sha256") for one in (first, run))
+        if first_data is None or run_data is None:  # runs of before 0.1.0
+            first_data, run_data = (_folder_of(one) for one in (first, run))
+        if first_data == run_data:
             continue
         why = (
-            f"{first.path} was made from {_folder_of(first)} ({str(wanted)[:12]}...), this one "
-            f"from {_folder_of(run)} ({str(found)[:12]}...)"
+            f"{first.path} was made from {_folder_of(first)} ({str(first_data)[:12]}...), this one "
+            f"from {_folder_of(run)} ({str(run_data)[:12]}...)"
         )
         fix = "compare runs of one sequence, and others with `gftorf compare RUN` one by one"
         raise InputError("runs of different sequences", where=run.path, why=why, fix=fix)
@@ -148,17 +148,17 @@ def _of_all(
 
 
 def _scored(
-    name: str, config: Mapping[str, Any], metrics: Mapping[str, Any], found: Findings
+    name: str, config: Mapping[str, Any], metrics: Mapping[str, Any], comparison: Comparison
 ) -> Scored:
-    judged, chi_square = found.judgement, None
-    if found.residuals is not None and found.residuals.noisy:
-        shown = found.views.frames[panels.telling_row(found)] // found.sequence.cycle
-        chi_square = found.residuals.chi_square[found.residuals.quartets.index(shown)]
+    judged, chi_square = comparison.judgement, None
+    if comparison.residuals is not None and comparison.residuals.noisy:
+        shown = comparison.views.frames[panels.telling_row(comparison)] // comparison.sequence.cycle
+        chi_square = comparison.residuals.chi_square[comparison.residuals.quartets.index(shown)]
     return Scored(
         name=name,
         config=config,
         metrics=metrics,
-        d=found.views.d,
+        d=comparison.views.d,
         error=None if judged is None else judged.errors["d"],
         chi_square=chi_square,
     )

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from . import figures, page, panels, provenance, tables
 from .legend import TO_READ
-from .panels import Findings
+from .panels import Comparison
 
 CLOSED_FORM, TRUTH = "closed form", "truth"
 RUN_COLOURS = "#0072b2 #009e73 #e69f00 #cc79a7 #56b4e9 #8c6d31 #666666".split()  # Okabe and Ito
@@ -48,25 +48,25 @@ class Scored:
     """Of the quartet that the page shows [1], at the size of the fit; None: not known."""
 
 
-def page_of(title: str, found: Findings, runs: Sequence[Scored]) -> str:
+def page_of(title: str, comparison: Comparison, runs: Sequence[Scored]) -> str:
     """The page.
 
     Args:
         title: Its heading.
-        found: The arrays of the first run: sequence, truth and closed form are those of all.
+        comparison: The arrays of the first run: sequence, truth and closed form are those of all.
         runs: All of them.
     """
-    s = panels.telling_row(found)
+    s = panels.telling_row(comparison)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.escape(runs[0].metrics["version"])}'
         f'</div><p class="verdict">{_verdict(runs)}</p>',
         page.section("Errors", _errors(runs), _said(runs)),
-        page.section("Side by side", _text(found, s), _sliders(found, runs, s)),
-        *_film(found, runs),
+        page.section("Side by side", _text(comparison, s), _sliders(comparison, runs, s)),
+        *_film(comparison, runs),
         *_by_class(runs),
-        page.section("Pictures", *_pictures(found, runs, s)),
-        *_curves(found, runs),
+        page.section("Pictures", *_pictures(comparison, runs, s)),
+        *_curves(comparison, runs),
         page.section("What differs", _differing(runs)),
         page.section("How it was made", *map(_made, runs)),
         page.section("How to read it", TO_READ),
@@ -131,19 +131,19 @@ def _said(runs: Sequence[Scored]) -> str:
     return f"<h3>Runs</h3>{page.table(['', *SAID], rows)}"
 
 
-def _text(found: Findings, s: int) -> str:
-    frame = found.views.frames[s]
+def _text(comparison: Comparison, s: int) -> str:
+    frame = comparison.views.frames[s]
     how = "The scroll bar, a swipe or the arrow keys move the edge."
     return page.caption(f"Raw frame {frame}: the first run, and every other one. {how}")
 
 
-def _sliders(found: Findings, runs: Sequence[Scored], s: int) -> str:
+def _sliders(comparison: Comparison, runs: Sequence[Scored], s: int) -> str:
     """The first run against each other one: distance, and error if the truth is known."""
     first, *others = runs
-    html, errors = "", panels.error_scale(found.judgement, s) if found.judgement else None
+    html, errors = "", panels.error_scale(comparison.judgement, s) if comparison.judgement else None
     for other in others:
         html += panels.slider(
-            first.d[s], other.d[s], found.distance_scale, (first.name, other.name)
+            first.d[s], other.d[s], comparison.distance_scale, (first.name, other.name)
         )
         if first.error is not None and other.error is not None and errors is not None:
             images = np.sqrt(first.error[s]), np.sqrt(other.error[s])
@@ -152,14 +152,14 @@ def _sliders(found: Findings, runs: Sequence[Scored], s: int) -> str:
     return f'<div class="sliders">{html}</div>'
 
 
-def _film(found: Findings, runs: Sequence[Scored]) -> list[str]:
+def _film(comparison: Comparison, runs: Sequence[Scored]) -> list[str]:
     """The section of the film; none if there is one quartet only."""
-    scale = found.distance_scale
-    shown = {CLOSED_FORM: (found.views.closed_form, scale)}
+    scale = comparison.distance_scale
+    shown = {CLOSED_FORM: (comparison.views.closed_form, scale)}
     shown |= {run.name: (run.d, scale) for run in runs}
-    if found.judgement is not None:
-        shown[TRUTH] = found.judgement.truth, scale
-    html = panels.film(found, shown)
+    if comparison.judgement is not None:
+        shown[TRUTH] = comparison.judgement.truth, scale
+    html = panels.film(comparison, shown)
     text = "Distance at the first raw frame of every quartet, slowed down."
     return [page.section("Quartet by quartet", page.caption(text), html)] if html else []
 
@@ -175,10 +175,10 @@ def _by_class(runs: Sequence[Scored]) -> list[str]:
     return [page.section("Edges and slopes", page.caption(text), bars)] if bars else []
 
 
-def _pictures(found: Findings, runs: Sequence[Scored], s: int) -> list[str]:
+def _pictures(comparison: Comparison, runs: Sequence[Scored], s: int) -> list[str]:
     """Distances, errors and chi-square of one raw frame."""
-    metres, judged = found.distance_scale, found.judgement
-    distances = [page.picture(found.views.closed_form[s], metres, CLOSED_FORM)]
+    metres, judged = comparison.distance_scale, comparison.judgement
+    distances = [page.picture(comparison.views.closed_form[s], metres, CLOSED_FORM)]
     distances += [page.picture(run.d[s], metres, run.name) for run in runs]
     html = []
     if judged is not None:
@@ -198,19 +198,23 @@ def _pictures(found: Findings, runs: Sequence[Scored], s: int) -> list[str]:
     ]
     if maps:
         html += ["<h3>Chi-square of the quads</h3>", page.row(maps, columns=4)]
-    return [f"<h3>Distance, raw frame {found.views.frames[s]}</h3>", page.row(distances, 4), *html]
+    return [
+        f"<h3>Distance, raw frame {comparison.views.frames[s]}</h3>",
+        page.row(distances, 4),
+        *html,
+    ]
 
 
-def _curves(found: Findings, runs: Sequence[Scored]) -> list[str]:
+def _curves(comparison: Comparison, runs: Sequence[Scored]) -> list[str]:
     """Error of every raw frame, and the histogram of errors; none without truth."""
-    judged = found.judgement
+    judged = comparison.judgement
     if judged is None:
         return []
     errors = {CLOSED_FORM: judged.errors["closed_form"]}
     errors |= {run.name: run.error for run in runs if run.error is not None}
     colours = zip(errors, [figures.COLOURS["closed_form"], *RUN_COLOURS * len(runs)], strict=False)
     styles = {name: (colour, name) for name, colour in colours}
-    drawn = panels.error_charts(found, judged, errors, styles)
+    drawn = panels.error_charts(comparison, judged, errors, styles)
     html = "".join(f"<h3>{title}</h3>{page.charts(svg, title)}" for title, svg in drawn.items())
     return [page.section("Curves", html)]
 

@@ -115,7 +115,7 @@ def bars(series: Mapping[str, Series]) -> str:
         for key in groups.values()
         for label, one in series.items()
     }
-    known = {place: value for place, value in values.items() if value is not None}
+    known = {cell: value for cell, value in values.items() if value is not None}
     if not known:
         return ""
     largest = max(*known.values(), 1e-9) ** 0.5  # roots are drawn
@@ -139,7 +139,7 @@ def bars(series: Mapping[str, Series]) -> str:
 
 
 def by_class(metrics: Mapping[str, Any]) -> str:
-    """Errors of moving and of static pixels by what the truth looks like around them."""
+    """Errors of moving and of static pixels at edges, and inside by the slope of the truth."""
     html = ""
     for group in ("moving", "static"):
         key, head, rows = f"classes.{group}", [""], []

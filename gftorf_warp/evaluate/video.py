@@ -96,15 +96,15 @@ def _counted(
 
 def _held(pictures: Iterator[Picture], total: int, where: Path) -> list[Picture]:
     """All pictures in memory, as the encoder of animations wants them."""
-    found = []
+    held = []
     for picture in pictures:
         if total * picture.nbytes > HELD_BYTES_MAX:
             why = f"{total} pictures of {picture.shape[1]}x{picture.shape[0]} must be in memory at "
             why += f"once: {total * picture.nbytes >> 20} MB, the most is {HELD_BYTES_MAX >> 20}"
             fix = "write .webm or .mp4, or fewer times"
             raise UsageError("too long for an animation", where=where, why=why, fix=fix)
-        found.append(picture)
-    return found
+        held.append(picture)
+    return held
 
 
 def _encode(path: Path, pictures: Iterable[Picture], rate: float, where: Path) -> None:
@@ -126,12 +126,12 @@ def _encode(path: Path, pictures: Iterable[Picture], rate: float, where: Path) -
         writer.write(np.ascontiguousarray(picture[..., ::-1]))
     if writer is not None:
         writer.release()
-    reader, found = cv2.VideoCapture(str(path)), 0
+    reader, readable = cv2.VideoCapture(str(path)), 0
     while reader.grab():
-        found += 1
+        readable += 1
     reader.release()
-    if found != count:
-        why = f"{found} of {count} pictures can be read back"
+    if readable != count:
+        why = f"{readable} of {count} pictures can be read back"
         fix = "check that the disk is not full"
         raise ResourceError("video damaged while writing", where=where, why=why, fix=fix)
 

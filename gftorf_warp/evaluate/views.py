@@ -354,8 +354,8 @@ def series_of(
     """Channels of each view as host arrays, valid while referenced; on CUDA, rendered ahead."""
     names = list(names)
     needed = sorted({image for name in names for image in renders.NEEDS[name]})
-    for found in on_host(render, views, needed, kept=kept):
-        yield {name: renders.named(name, found, sensor) for name in names}
+    for images in on_host(render, views, needed, kept=kept):
+        yield {name: renders.named(name, images, sensor) for name in names}
 
 
 def views_to_take(
@@ -365,8 +365,8 @@ def views_to_take(
     poses: str | Path | Float[np.ndarray, "M 4 4"] | None,
 ) -> tuple[list[float], list[Camera]]:
     """Time [s] and camera of every image of :func:`render_to_folder`, whose arguments these are."""
-    found = None if poses is None else read_poses(poses, sequence)
-    default = sequence.times if found is None else [middle(sequence)]
+    camera_poses = None if poses is None else read_poses(poses, sequence)
+    default = sequence.times if camera_poses is None else [middle(sequence)]
     seconds = [float(t) for t in (default if times is None else times)]
     if not seconds:
         why, fix = "the list is empty", "leave --times out"
@@ -377,11 +377,11 @@ def views_to_take(
         why = f"the sequence tells of 0 to {last:.6g} s, nothing of {outside[0]:.6g} s"
         fix = "choose times in between, in seconds, or leave --times out"
         raise UsageError("no such time", where="--times", why=why, fix=fix)
-    if found is None:
+    if camera_poses is None:
         nearest = [_nearest_frame(sequence, time) for time in seconds]
         known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}
         return seconds, [known[n] for n in nearest]
-    count = max(len(seconds), len(found))
-    cameras = [run.camera.at(pose) for pose in found]
+    count = max(len(seconds), len(camera_poses))
+    cameras = [run.camera.at(pose) for pose in camera_poses]
     seconds = [seconds[k % len(seconds)] for k in range(count)]
-    return seconds, [cameras[k % len(found)] for k in range(count)]
+    return seconds, [cameras[k % len(camera_poses)] for k in range(count)]

@@ -19,7 +19,7 @@ from ..data.files import atomic_path
 from ..data.read import read
 from ..errors import BusyError, InputError
 from ..evaluate.compare import score
-from ..evaluate.panels import Findings, telling_row
+from ..evaluate.panels import Comparison, telling_row
 from ..recon.observations import data_hash
 from ..recon.settings import plain
 from ..recon.suitable import check_sequence
@@ -158,7 +158,7 @@ def _while_parent_lives():
     return check
 
 
-def _keep_picture(path: Path, found: Findings) -> None:
+def _keep_picture(path: Path, found: Comparison) -> None:
     """Distance, truth and closed form of the frame with the most to see, as float16 [m]."""
     s = telling_row(found)
     images = {"d": found.views.d[s], "closed_form": found.views.closed_form[s]}
