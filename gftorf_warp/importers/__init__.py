@@ -1,1 +1,1 @@
-"""Foreign recordings as sequences: a reader for each kind of source, and the keys it asks for."""
+"""Foreign recordings as sequences: a reader for each kind of source, and its keys."""

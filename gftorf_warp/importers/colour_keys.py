@@ -261,10 +261,10 @@ def _poses(
     if matrix is not None and not rigid(matrix[None]).all():
         why = f"expected a rotation and a translation, found {matrix.tolist()}"
         raise settings.wrong("colour.tof_from_colour", why, "give a 4x4 matrix in metres")
-    own = pose_keys.poses_of(settings, source, notes, taken, 1, names, POSES)
+    at_images = pose_keys.poses_of(settings, source, notes, taken, 1, names, POSES)
     both = np.concatenate([times, taken])
-    if own is not None:
-        poses = np.linalg.inv(interpolated(both, taken, np.linalg.inv(own)))
+    if at_images is not None:
+        poses = np.linalg.inv(interpolated(both, taken, np.linalg.inv(at_images)))
         if tof_from_world is None and matrix is not None:
             notes.understood.append("poses: those of the colour camera by colour.tof_from_colour")
             if times[0] < taken[0] or times[-1] > taken[-1]:

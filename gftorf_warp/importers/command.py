@@ -131,14 +131,14 @@ def _refuse_different(out: Path, write: Callable[[Path], Path]) -> None:
     It is written again beside it, and the sums of all files are compared.
     """
     sweep(out)  # of a process that was killed here
-    place = temporary_name(out.absolute())
+    temporary = temporary_name(out.absolute())
     try:
-        with as_errors(place):
-            place.mkdir()
-        copy = write(place / "capture")
+        with as_errors(temporary):
+            temporary.mkdir()
+        copy = write(temporary / "capture")
         same = all(read_text(out / n) == read_text(copy / n) for n in (MANIFEST, README))
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     if not same:
         why, fix = "it holds another import", "choose another path, or remove the folder first"
         raise UsageError("folder is not empty", where=out, why=why, fix=fix)

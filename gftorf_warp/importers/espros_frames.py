@@ -73,8 +73,8 @@ def _raw(files: list[Path], notes: Notes) -> Quartets:
             headers.append(header)
             first += HEADER.size + len(data)
     if len({image.shape for image in images}) != 1:
-        found = ", ".join(sorted({f"{i.shape[2]}x{i.shape[1]}" for i in images})) or "none"
-        why, fix = f"expected raw frames of one size, found {found}", "split the recording"
+        sizes = ", ".join(sorted({f"{i.shape[2]}x{i.shape[1]}" for i in images})) or "none"
+        why, fix = f"expected raw frames of one size, found {sizes}", "split the recording"
         raise InputError("no raw frames", where=files[0].parent, why=why, fix=fix)
     low, mid, high = headers[0][8:11]
     degrees = [header[11] / 100 for header in headers]
@@ -113,14 +113,14 @@ def _recorded(files: list[Path], turned: bool | None, notes: Notes) -> Quartets:
         why, fix = f"expected one recording, found {len(files)} files", "name the file"
         raise InputError("several files", where=path.parent, why=why, fix=fix)
     with open_hdf5(path) as file:
-        found = datasets(file)
-        group = next((g for g in ("DCS/", "") if f"{g}frames" in found), None)
+        by_name = datasets(file)
+        group = next((g for g in ("DCS/", "") if f"{g}frames" in by_name), None)
         if group is None:
-            why = f"expected DCS/frames, found {', '.join(found)[:200] or 'nothing'}"
+            why = f"expected DCS/frames, found {', '.join(by_name)[:200] or 'nothing'}"
             fix = "record with image type DCS: distances and amplitudes are decoded already"
             raise InputError("no DCS", where=path, why=why, fix=fix)
-        frames = checked(path, found[f"{group}frames"])
-        times = found.get(f"{group}timestamps")
+        frames = checked(path, by_name[f"{group}frames"])
+        times = by_name.get(f"{group}timestamps")
         stored = None if times is None else checked(path, times).astype(np.float64).reshape(-1)
         f_mod = file.attrs.get("mod_frequency")
     notes.understood.append(f"file: {path.name}, {group}frames, {frames.dtype} {frames.shape}")

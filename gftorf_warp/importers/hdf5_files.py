@@ -51,28 +51,28 @@ def read_dataset(path: Path, name: str | None = None) -> np.ndarray:
         ResourceError: If h5py is not installed.
     """
     with open_hdf5(path) as file:
-        found = datasets(file)
-        images = [key for key, dataset in found.items() if dataset.ndim >= 2]
+        by_name = datasets(file)
+        images = [key for key, dataset in by_name.items() if dataset.ndim >= 2]
         if name is None and len(images) != 1:
-            raise _no_dataset(path, "one dataset of images", found)
+            raise _no_dataset(path, "one dataset of images", by_name)
         key = images[0] if name is None else name.strip("/")
-        if key not in found:
-            raise _no_dataset(path, f"a dataset {key!r}", found)
-        return checked(path, found[key])
+        if key not in by_name:
+            raise _no_dataset(path, f"a dataset {key!r}", by_name)
+        return checked(path, by_name[key])
 
 
 def datasets(file: h5py.File) -> dict[str, Any]:
     """All datasets of a file by name, those behind links not among them."""
     import h5py
 
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
 
     def visit(name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset):
-            found[name] = item
+            by_name[name] = item
 
     file.visititems(visit)
-    return found
+    return by_name
 
 
 def checked(path: Path, dataset: h5py.Dataset) -> np.ndarray:
@@ -97,8 +97,8 @@ def checked(path: Path, dataset: h5py.Dataset) -> np.ndarray:
     return np.asarray(dataset[()])
 
 
-def _no_dataset(path: Path, expected: str, found: dict[str, Any]) -> InputError:
-    shapes = [f"{name} {dataset.shape}" for name, dataset in found.items()]
+def _no_dataset(path: Path, expected: str, by_name: dict[str, Any]) -> InputError:
+    shapes = [f"{name} {dataset.shape}" for name, dataset in by_name.items()]
     why = f"expected {expected}, found {', '.join(shapes)[:400] or 'none'}"
     fix = "name one, by source.dataset for kind arrays"
     return InputError("no such dataset", where=path, why=why, fix=fix)

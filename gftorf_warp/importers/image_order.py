@@ -57,13 +57,13 @@ def patterns_of(source: Path, settings: Settings) -> list[list[Path]]:
         if settings.given("source.files"):
             why, fix = f"{source} is a file", "give its folder, or leave source.files out"
             raise settings.wrong("source.files", why, fix)
-        found = [[source]]
+        files = [[source]]
     elif settings.given("source.files"):
         patterns = settings["source.files"]
-        found = [matching(source, pattern, settings, "source.files") for pattern in patterns]
+        files = [matching(source, pattern, settings, "source.files") for pattern in patterns]
     else:
-        found = [_images(source)]
-    return found
+        files = [_images(source)]
+    return files
 
 
 def read_images(
@@ -115,14 +115,14 @@ def frame_numbers(files: list[Path], settings: Settings, notes: Notes) -> list[i
     Raises:
         InputError: If they should, and two have one number, or none.
     """
-    found = [re.findall(r"\d+", path.stem) for path in files]
-    if not all(found):
+    digit_runs = [re.findall(r"\d+", path.stem) for path in files]
+    if not all(digit_runs):
         if settings["source.numbered"]:
-            name = files[[bool(numbers) for numbers in found].index(False)].name
+            name = files[[bool(numbers) for numbers in digit_runs].index(False)].name
             why = f"expected a number in each name, found {name}"
             raise settings.wrong("source.numbered", why, "leave it out, or name files by number")
         return None
-    numbers = [int(digits[-1]) for digits in found]
+    numbers = [int(digits[-1]) for digits in digit_runs]
     gaps = [b for a, b in itertools.pairwise(numbers) if b != a + 1]
     if not settings["source.numbered"]:
         if gaps and len(set(numbers)) == len(numbers):
@@ -147,15 +147,15 @@ def matching(root: Path, pattern: str, settings: Settings, name: str) -> list[Pa
         InputError: If there are none, or one lies outside the folder.
     """
     try:
-        found = sorted((path for path in root.glob(pattern) if path.is_file()), key=_natural)
+        files = sorted((path for path in root.glob(pattern) if path.is_file()), key=_natural)
     except (ValueError, NotImplementedError, IndexError) as error:  # absolute, or no pattern
         why = f"expected a pattern such as quads/*.png, found {pattern!r} ({error})"
         raise settings.wrong(name, why, "name files relative to the folder") from error
-    if not found:
+    if not files:
         why = f"no file of {root} matches {pattern!r}"
         raise settings.wrong(name, why, "correct the pattern")
-    _refuse_outside(root, found)
-    return found
+    _refuse_outside(root, files)
+    return files
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -164,15 +164,15 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _images(root: Path) -> list[Path]:
     """All files of a folder with a suffix of images, which must be one."""
-    found = [p for p in root.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
-    suffixes = {path.suffix.lower() for path in found}
+    files = [p for p in root.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+    suffixes = {path.suffix.lower() for path in files}
     if len(suffixes) != 1:
         kinds = ", ".join(sorted(suffixes)) or "none"
         why = f"expected files of one of the formats {', '.join(SUFFIXES)}, found {kinds}"
         fix = "give a folder of images, or name them, by source.files"
         raise InputError("no images", where=root, why=why, fix=fix)
-    _refuse_outside(root, found)
-    return sorted(found, key=_natural)
+    _refuse_outside(root, files)
+    return sorted(files, key=_natural)
 
 
 def _refuse_outside(root: Path, files: list[Path]) -> None:

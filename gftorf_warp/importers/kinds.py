@@ -22,7 +22,7 @@ class Kind:
     """What it reads, in a line."""
     read: Callable[[Path, Settings], Imported]
     """Reads a file or folder with the values of the keys. A reader that finds the source is not
-    what it should be raises an InputError, and it asks for keys by ``settings.require``."""
+    what it should be raises an InputError; ``settings.require`` refuses missing keys."""
     keys: tuple[Key, ...] = ()
     """Keys of its TOML file."""
 

@@ -94,14 +94,14 @@ def _dump(source: Path, notes: Notes) -> Dump:
     """
     dump = _by_size(source)
     several = f"one or more files of a multiple of {packets.PACKET_BYTES}"
-    for found, count, what, expected in (
+    for files, count, what, expected in (
         (dump.packets, range(1, FRAMES_MAX), "packets", several),
         (dump.p0, range(1, 2), "P0 tables", f"one file of {packets.P0_BYTES}"),
         (dump.lookup, range(2), "lookup table", f"at most one file of {2 * packets.CODES}"),
         (dump.tables, range(3), "X and Z tables", f"at most two files of {packets.TABLE_BYTES}"),
     ):
-        if len(found) not in count:
-            names = ", ".join(path.name for path in found)
+        if len(files) not in count:
+            names = ", ".join(path.name for path in files)
             sizes = ", ".join(f"{path.name} ({size_of(path)})" for path in dump.others[:5])
             why = f"expected {expected} bytes, found "
             why += names or f"none; other files: {sizes or 'none'}"

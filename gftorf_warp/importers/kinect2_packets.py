@@ -1,7 +1,7 @@
 """Bytes of a Kinect v2 as numbers: packets of its infrared camera and the tables to decode them.
 
 A packet is ten sub-images of 512x424 codes of 11 bits: three shifts at each of three frequencies,
-and one that nobody uses. The table P0 has the phase offset of each pixel, X and Z the ray.
+and one that is not used. The table P0 has the phase offset of each pixel, X and Z the ray.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def codes(packet: np.ndarray) -> UInt16[np.ndarray, "9 424 512"]:
     word, low = bit >> 4, (bit & 15).astype(np.uint32)
     following = np.minimum(word + 1, words.shape[2] - 1)  # the last code ends with its word
     rows = np.concatenate([words[:, :half], words[:, : half - 1 : -1]], axis=1)
-    found = rows[..., word] >> low | rows[..., following] << (np.uint32(16) - low)
-    return (found & np.uint32(CODES - 1)).astype(np.uint16)
+    values = rows[..., word] >> low | rows[..., following] << (np.uint32(16) - low)
+    return (values & np.uint32(CODES - 1)).astype(np.uint16)
 
 
 def usual_values() -> Float[np.ndarray, "2048"]:

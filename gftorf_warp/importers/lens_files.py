@@ -83,10 +83,10 @@ def read_object(path: Path) -> dict[str, Any]:
     Raises:
         InputError: If it is none.
     """
-    found = read_json(path)
-    if not isinstance(found, dict):
-        raise unreadable(path, f"expected a JSON object, found {type(found).__name__}")
-    return found
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise unreadable(path, f"expected a JSON object, found {type(content).__name__}")
+    return content
 
 
 def _colmap(path: Path, number: int | None) -> Lens:
@@ -101,8 +101,8 @@ def _colmap(path: Path, number: int | None) -> Lens:
     if not names or len(words) != 4 + len(names):
         why = f"expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of {', '.join(COLMAP)} in "
         raise unreadable(path, f"{why}line {line}, found {' '.join(words)[:100]!r}")
-    width, height, *found = numbers(path, line, words[2:])
-    values = dict(zip(names, found, strict=True))
+    width, height, *parameters = numbers(path, line, words[2:])
+    values = dict(zip(names, parameters, strict=True))
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
     _refuse_others(path, values)
@@ -110,10 +110,10 @@ def _colmap(path: Path, number: int | None) -> Lens:
     return Lens(values=values, size=size, pixel_centre="half", form=f"COLMAP {words[1]}")
 
 
-def _nerfstudio(path: Path, found: dict[str, Any]) -> Lens:
-    model = found.get("camera_model", "OPENCV")
+def _nerfstudio(path: Path, content: dict[str, Any]) -> Lens:
+    model = content.get("camera_model", "OPENCV")
     keys = [*NERFSTUDIO, *DISTORTION, "k4", "k5", "k6", "w", "h"]
-    stated = {key: found[key] for key in keys if key in found}
+    stated = {key: content[key] for key in keys if key in content}
     plain = all(type(value) in (int, float) for value in stated.values())
     missing = [key for key in NERFSTUDIO if key not in stated]
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or not plain or missing:
@@ -146,13 +146,13 @@ def _opencv(path: Path, content: str) -> Lens:
         raise unreadable(path, f"{why}{', '.join(LENSES)}, found {matrix} and {lens}")
     (fx, skew, cx), (_, fy, cy), _ = matrix.reshape(3, 3).tolist()
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
-    found = [] if lens is None else lens.reshape(-1).tolist()
+    coefficients = [] if lens is None else lens.reshape(-1).tolist()
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
-    values |= dict(zip(names, found, strict=False))
+    values |= dict(zip(names, coefficients, strict=False))
     _refuse_others(path, values)
     note = "four distortion coefficients are taken as k1, k2, p1, p2, not as a fisheye's"
     size = (int(sides[0]), int(sides[1])) if min(sides) > 0 else None
-    note = note if len(found) == 4 and any(found) else ""
+    note = note if len(coefficients) == 4 and any(coefficients) else ""
     return Lens(values=values, size=size, pixel_centre="integer", form="OpenCV", note=note)
 
 

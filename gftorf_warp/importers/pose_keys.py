@@ -113,14 +113,14 @@ def poses_of(
     form = settings[f"{table}.form"]
     backward = settings[f"{table}.direction"] == DIRECTIONS[0]
     opengl = settings[f"{table}.axes"] == "opengl"
-    found = read_trajectory(path, form, world_to_camera=backward, opengl=opengl)
+    trajectory = read_trajectory(path, form, world_to_camera=backward, opengl=opengl)
     metres = settings[f"{table}.metres_per_unit"] or 1.0
-    poses, how = _at(settings, table, found, times, cycle, files, path, notes)
+    poses, how = _at(settings, table, trajectory, times, cycle, files, path, notes)
     poses[:, :3, 3] *= metres
     axes = f", camera axes {settings[f'{table}.axes']}" if form in ("tum", "matrices") else ""
     notes.understood.append(
-        f"{table}: {len(found.camera_to_world)} of {path.name} ({form}{axes}, {metres:g} m a unit "
-        f"({settings.source(f'{table}.metres_per_unit')})), {how}"
+        f"{table}: {len(trajectory.camera_to_world)} of {path.name} ({form}{axes}, {metres:g} m "
+        f"a unit ({settings.source(f'{table}.metres_per_unit')})), {how}"
     )
     return np.linalg.inv(poses)
 
@@ -128,7 +128,7 @@ def poses_of(
 def _at(
     settings: Settings,
     table: str,
-    found: Trajectory,
+    trajectory: Trajectory,
     times: Float[np.ndarray, "F"],
     cycle: int,
     files: list[str] | None,
@@ -136,18 +136,18 @@ def _at(
     notes: Notes,
 ) -> tuple[Float[np.ndarray, "F 4 4"], str]:
     """Camera to world at each time in the file's unit, and how it was found, in words."""
-    poses = found.camera_to_world
-    if found.stamps is not None:
+    poses = trajectory.camera_to_world
+    if trajectory.stamps is not None:
         wanted = times + settings[f"{table}.start_s"]
-        first, last = found.stamps[[0, -1]]
+        first, last = trajectory.stamps[[0, -1]]
         if wanted[0] < first or wanted[-1] > last:
             why = (
                 f"raw frames are from {wanted[0]:.9g} to {wanted[-1]:.9g} s of {path.name}, which "
             )
             why += f"has poses from {first:.9g} to {last:.9g} s"
             raise settings.wrong(f"{table}.start_s", why, "correct it, or the times")
-        return interpolated(wanted, found.stamps, poses), "interpolated"
-    names = found.names
+        return interpolated(wanted, trajectory.stamps, poses), "interpolated"
+    names = trajectory.names
     if names is not None:
         chosen = [_named(file, names) for file in files or []]
         present = [n for n in chosen if n is not None]

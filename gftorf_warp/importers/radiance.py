@@ -26,14 +26,14 @@ def read_radiance(path: Path, size: tuple[int, int] | None = None) -> Float[np.n
 
     data = raw_bytes(path)
     head = data[:HEAD_BYTES].tobytes()
-    found = SIZE.search(head)
-    if not head.startswith(b"#?") or found is None:
+    match = SIZE.search(head)
+    if not head.startswith(b"#?") or match is None:
         raise unreadable(path, f"expected a Radiance image, found {head[:16]!r}")
-    shape = int(found[1]), int(found[2])
+    shape = int(match[1]), int(match[2])
     if not (0 < min(shape) and max(shape) <= SIDE_MAX) or (size is not None and shape != size):
         expected = f"{size[1]}x{size[0]}" if size is not None else f"at most {SIDE_MAX} wide"
         raise unreadable(path, f"expected pixels {expected}, found {shape[1]}x{shape[0]}")
-    if size_of(path) - found.end() < 4 * shape[0]:  # a row takes at least four bytes
+    if size_of(path) - match.end() < 4 * shape[0]:  # a row takes at least four bytes
         raise unreadable(path, "truncated")
     try:
         with without_log_of_opencv():

@@ -25,13 +25,13 @@ def files_of(source: Path) -> list[Path]:
         return [source]
     try:
         check_links(source)
-        found = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
+        files = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
     except OSError as error:
         raise unreadable(source, error.strerror or str(error)) from error
-    if not found:
+    if not files:
         why, fix = "expected the files of a recording, found none", "check the path"
         raise InputError("an empty folder", where=source, why=why, fix=fix)
-    return sorted(found, key=lambda path: natural(path.name))
+    return sorted(files, key=lambda path: natural(path.name))
 
 
 def check_room(need: Need, where: Path) -> None:
@@ -75,14 +75,14 @@ def buffers_of(
     Raises:
         InputError: If a file is empty or has a part of a buffer.
     """
-    found = []
+    buffers = []
     for path in files:
         size = size_of(path)
         if size == 0 or size % step:
             why = f"expected buffers of {step} bytes ({what}), found {size} bytes{hint(size)}"
             raise InputError("not whole buffers", where=path, why=why, fix="correct the keys")
-        found += [(path, first) for first in range(0, size, step)]
-    return found
+        buffers += [(path, first) for first in range(0, size, step)]
+    return buffers
 
 
 def raw_bytes(path: Path, first: int = 0, count: int | None = None) -> UInt8[np.ndarray, "n"]:

@@ -40,10 +40,10 @@ def read_torf(source: Path, settings: Settings) -> Imported:
 
 
 def _read(form: str, source: Path, settings: Settings) -> Imported:
-    found = format_of(source)
-    if found != form:
-        why = f"expected a folder of format {form}, found one of format {found}"
-        fix = "a capture needs no import" if found == "capture" else f"gftorf import {found}"
+    kind = format_of(source)
+    if kind != form:
+        why = f"expected a folder of format {form}, found one of format {kind}"
+        fix = "a capture needs no import" if kind == "capture" else f"gftorf import {kind}"
         raise InputError(f"no {form} folder", where=source, why=why, fix=fix)
     sequence = read(source, frame_rate_hz=settings["time.rate_hz"])
     sources = sequence.sources.items()

@@ -37,10 +37,10 @@ def numbers(path: Path, number: int, words: Items[str]) -> list[float]:
         InputError: If one is none; names the line.
     """
     try:
-        found = [float(word) for word in words]
+        values = [float(word) for word in words]
     except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
+        values = [math.nan]
+    if not all(map(math.isfinite, values)):
         why = f"expected finite numbers in line {number}, found {' '.join(words)[:80]!r}"
         raise unreadable(path, why)
-    return found
+    return values

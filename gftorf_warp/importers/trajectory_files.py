@@ -49,14 +49,14 @@ def read_trajectory(path: Path, form: str, *, world_to_camera: bool, opengl: boo
         InputError: If it is not of this form, or a pose is no rotation and translation.
     """
     if form == "colmap":
-        found = _colmap(path)
+        trajectory = _colmap(path)
     elif form == "tum":
-        found = _tum(path)
+        trajectory = _tum(path)
     elif form == "nerfstudio":
-        found = _nerfstudio(path)
+        trajectory = _nerfstudio(path)
     else:
-        found = Trajectory(camera_to_world=_matrices(path))
-    poses = found.camera_to_world
+        trajectory = Trajectory(camera_to_world=_matrices(path))
+    poses = trajectory.camera_to_world
     fine = rigid(poses)
     if not fine.all():
         n = int(np.argmin(fine))
@@ -67,7 +67,7 @@ def read_trajectory(path: Path, form: str, *, world_to_camera: bool, opengl: boo
         poses = np.linalg.inv(poses)
     if form == "nerfstudio" or (opengl and form != "colmap"):
         poses = poses @ FLIP
-    return Trajectory(camera_to_world=poses, stamps=found.stamps, names=found.names)
+    return Trajectory(camera_to_world=poses, stamps=trajectory.stamps, names=trajectory.names)
 
 
 def _colmap(path: Path) -> Trajectory:

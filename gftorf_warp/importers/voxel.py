@@ -53,9 +53,9 @@ def read(source: Path, settings: Settings) -> Imported:
         settings.require("time.slot_period_s")
     settings.require()
     notes = Notes()
-    found = list(packets(source))
-    frames = [packet for packet in found if isinstance(packet, Data)]
-    tables = [packet for packet in found if isinstance(packet, dict)]
+    all_packets = list(packets(source))
+    frames = [packet for packet in all_packets if isinstance(packet, Data)]
+    tables = [packet for packet in all_packets if isinstance(packet, dict)]
     shape = _shape(source, tables, notes)
     if not frames:
         why, fix = "expected frames, found settings only", "record again"
@@ -115,8 +115,8 @@ def _one_shape(source: Path, table: dict[str, int | bytes]) -> tuple[int, int, i
     values = {name: value for name, value in table.items() if isinstance(value, int)}
     kind = values.get("tofFrameType")
     if kind != QUADS:
-        found = TYPES[kind] if kind in TYPES else f"tofFrameType {kind}"
-        why = f"expected quads, found {found}, which the controller has computed already"
+        frame_type = TYPES[kind] if kind in TYPES else f"tofFrameType {kind}"
+        why = f"expected quads, found {frame_type}, which the controller has computed already"
         fix = "record with a controller that passes quads"
         raise InputError("no quads", where=source, why=why, fix=fix)
     sides = []

@@ -72,9 +72,9 @@ def packets(path: Path) -> Iterator[Data | dict[str, int | bytes]]:
         if kind == DATA:
             yield _data(path, body, length)
         else:
-            found = _settings(path, body, raw_bytes(path, body, length).tobytes())
-            if found is not None:
-                yield found
+            settings = _settings(path, body, raw_bytes(path, body, length).tobytes())
+            if settings is not None:
+                yield settings
         first = body + length
 
 
@@ -101,16 +101,16 @@ def _settings(path: Path, body: int, content: bytes) -> dict[str, int | bytes] |
     if (length, table) != (len(left) + 4, len(left)):
         why = f"expected a table of {len(left)} bytes, found sizes {length} and {table}"
         raise _damaged(path, body, why)
-    found: dict[str, int | bytes] = {}
+    values: dict[str, int | bytes] = {}
     while left:
         name, left = _text(path, body, left)
         if name in TEXTS:
-            found[name.decode()], left = _text(path, body, left)
+            values[name.decode()], left = _text(path, body, left)
         elif name in NUMBERS and len(left) >= 4:
-            found[name.decode()], left = int.from_bytes(left[:4], "little"), left[4:]
+            values[name.decode()], left = int.from_bytes(left[:4], "little"), left[4:]
         else:
             raise _damaged(path, body, f"expected a known name and its value, found {name[:40]!r}")
-    return found
+    return values
 
 
 def _text(path: Path, body: int, left: bytes) -> tuple[bytes, bytes]:
