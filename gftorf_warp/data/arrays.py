@@ -52,12 +52,14 @@ def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
     Raises:
         InputError: If a file is not valid, or files of one field disagree.
     """
-    found = {path: read_array(root / path, field) for path in field.paths if (root / path).exists()}
-    if not found:
+    arrays = {
+        path: read_array(root / path, field) for path in field.paths if (root / path).exists()
+    }
+    if not arrays:
         return None
-    path, first = next(iter(found.items()))
-    if any(not np.array_equal(_compared(array), _compared(first)) for array in found.values()):
-        texts = ", ".join(f"{array.tolist()} in {name}" for name, array in found.items())
+    path, first = next(iter(arrays.items()))
+    if any(not np.array_equal(_compared(array), _compared(first)) for array in arrays.values()):
+        texts = ", ".join(f"{array.tolist()} in {name}" for name, array in arrays.items())
         why = f"expected the same value in all of its files, found {texts}"
         raise _invalid(root / path, field, "files disagree", why, "remove the wrong file")
     return first, path
@@ -76,9 +78,9 @@ def map_array(path: Path) -> np.ndarray:
     except Exception as error:  # the header is a Python literal: a damaged one raises anything
         why = f"expected an array as numpy.save writes it, found {error}"
         raise unreadable(path, why) from error
-    expected, found = array.offset + array.nbytes, path.stat().st_size
-    if found != expected:
-        raise unreadable(path, f"expected {expected} bytes, found {found}")
+    expected, size = array.offset + array.nbytes, path.stat().st_size
+    if size != expected:
+        raise unreadable(path, f"expected {expected} bytes, found {size}")
     return array
 
 
@@ -144,11 +146,11 @@ def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
     with _open(path, field) as file:
         shape, fortran, dtype = _header(path, field, file)
         _check(path, field, shape, dtype, sizes)
-        found = path.stat().st_size - file.tell()
+        size = path.stat().st_size - file.tell()
         expected = math.prod(shape) * dtype.itemsize
-        if found != expected:
-            what = f"file is {'truncated' if found < expected else 'longer than its array'}"
-            why = f"expected {expected} bytes of data for shape {shape} of {dtype}, found {found}"
+        if size != expected:
+            what = f"file is {'truncated' if size < expected else 'longer than its array'}"
+            why = f"expected {expected} bytes of data for shape {shape} of {dtype}, found {size}"
             raise _invalid(path, field, what, why, "copy or export the file again")
         data = np.frombuffer(file.read(expected), dtype=dtype, count=math.prod(shape))
     return data.reshape(shape, order="F" if fortran else "C")
@@ -228,8 +230,8 @@ def _shape_text(allowed: tuple[int | str, ...], sizes: Mapping[str, int]) -> str
 
 def _open(path: Path, field: Field) -> Any:
     if not path.is_file():  # opening a pipe would block
-        found = "a folder" if path.is_dir() else "nothing that can be read"
-        why = f"expected a file, found {found}"
+        kind = "a folder" if path.is_dir() else "nothing that can be read"
+        why = f"expected a file, found {kind}"
         raise _invalid(path, field, "no such file", why, "complete the folder")
     try:
         return path.open("rb")

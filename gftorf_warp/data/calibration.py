@@ -60,8 +60,8 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         adc_zero=(scalar("adc_zero", "adc_zero") or 0.0) if raw else 0.0,
         quad_scale=scalar("quad_values_scale_factor", "quad_scale"),
     )
-    found = problems.attempt(_tof_intrinsics, root, fields, sources, width)
-    intrinsics, half = found or (UNREAD, 0.0)
+    lens = problems.attempt(_tof_intrinsics, root, fields, sources, width)
+    intrinsics, half = lens or (UNREAD, 0.0)
     return Calibrated(calibration=calibration, intrinsics=intrinsics, half=half, sources=sources)
 
 

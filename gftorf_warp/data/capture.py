@@ -179,8 +179,8 @@ def _files(
     """Files of the wanted raw frames in a folder; ids of none of all ``frames`` are errors, and so
     is a missing file that the manifest names, unless the whole folder is gone.
     """
-    found = numbered(root, f"{folder}/{{id}}.exr")
-    for n, file in found.items():
+    files = numbered(root, f"{folder}/{{id}}.exr")
+    for n, file in files.items():
         if n >= frames:
             why = f"expected files of raw frames below {frames}; found {n}"
             problems.add("no raw frame", file, why, "remove it")
@@ -188,7 +188,7 @@ def _files(
         if name.startswith(f"{folder}/") and not os.path.lexists(root / name):
             why, fix = f"{MANIFEST} names it", f"restore it, or remove {MANIFEST}"
             problems.add("no such file", root / name, why, fix)
-    return {n: file for n, file in found.items() if n in wanted}
+    return {n: file for n, file in files.items() if n in wanted}
 
 
 def _manifest(root: Path) -> dict[str, str]:
@@ -348,8 +348,8 @@ def _sources(
             file = f"{NAME} {field.key}" if field.kind == "json" else folder
             if field.role != "truth":
                 sources[name] = f"file {file}" if there else "default none"
-    for name, found in images.items():
-        sources[name] += f", {len(found)} images" if found else ""
+    for name, by_frame in images.items():
+        sources[name] += f", {len(by_frame)} images" if by_frame else ""
     sources["measured"] += f": {measured} of {len(values['id'])} raw frames"
     sources["pixel_centre"] = f"file {NAME} pixel_centre: half"
     return sources

@@ -52,9 +52,9 @@ def read_values(root: Path) -> dict[str, Any]:
         problems.attempt(_refuse_unknown, path, frame, f"{FRAMES}[{number}]", f"{FRAMES}.")
     values = {}
     for name, field in json_fields().items():
-        found = problems.attempt(_value, path, content, field)
-        if found is not None:
-            values[name] = found
+        value = problems.attempt(_value, path, content, field)
+        if value is not None:
+            values[name] = value
     problems.raise_if_any(path)
     return values
 
@@ -143,9 +143,9 @@ def _flatten(value: Any) -> tuple[list[Any], tuple[int, ...]]:
 
 
 def _wrong(
-    path: Path, where: str, expected: str, found: Any, fix: str = "correct the file"
+    path: Path, where: str, expected: str, value: Any, fix: str = "correct the file"
 ) -> InputError:
-    text = "nothing" if found is None else json.dumps(found, default=str)
+    text = "nothing" if value is None else json.dumps(value, default=str)
     shown = text if len(text) <= 80 else f"{text[:77]}..."
     why = f"expected {expected}, found {shown}"
     return InputError(f"{where}: not valid in a capture", where=path, why=why, fix=fix)

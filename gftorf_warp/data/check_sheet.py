@@ -32,10 +32,10 @@ def check_sheet(sequence: Sequence, report: Report) -> bytes:
 
 def _hypotheses(sequence: Sequence) -> list[Panel]:
     """Distances on one scale; a better order than the stated one is marked."""
-    found, end = hypotheses(sequence)[:SHOWN], SPEED_OF_LIGHT / (2.0 * sequence.frequencies[0])
+    shown, end = hypotheses(sequence)[:SHOWN], SPEED_OF_LIGHT / (2.0 * sequence.frequencies[0])
     return [
-        scaled(_title(k, one, found[0]), np.asarray(one.distance), (0.0, end), viridis)
-        for k, one in enumerate(found)
+        scaled(_title(k, one, shown[0]), np.asarray(one.distance), (0.0, end), viridis)
+        for k, one in enumerate(shown)
     ]
 
 

@@ -61,7 +61,7 @@ class ConstantPart:
 
     def advice(self, sequence: Sequence, form: str) -> str:
         """Which value of the calibration to change, and to what."""
-        zero_at, dc_at = (specs.place(form, name) for name in ("adc_zero", "dc_offset"))
+        zero_at, dc_at = (specs.location(form, name) for name in ("adc_zero", "dc_offset"))
         zero = f"{zero_at} = {sequence.calibration.adc_zero + self.zero:.5g} and dc_offset 0"
         dc = f"{dc_at} = {self.dc_offset:.4g}"
         if self.is_zero is None:

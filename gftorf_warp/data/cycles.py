@@ -52,8 +52,8 @@ def frequencies_by_order(frequencies: Float[np.ndarray, "F"]) -> tuple[float, ..
 
 def frequencies_decoded(frequencies: Float[np.ndarray, "K"], wanted: tuple[float, ...]) -> bool:
     """Whether these frequencies are the wanted ones, each three times or more."""
-    found, counts = np.unique(frequencies, return_counts=True)
-    return set(found.tolist()) == set(wanted) and int(counts.min()) >= QUADS_MIN
+    distinct, counts = np.unique(frequencies, return_counts=True)
+    return set(distinct.tolist()) == set(wanted) and int(counts.min()) >= QUADS_MIN
 
 
 def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:

@@ -96,8 +96,8 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
         rows = solution(shifts)
         if rows is None:
             where = f"{sequence.path or 'sequence'}, frames {first} .. {last}"
-            found = f"{np.degrees(shifts).tolist()} degrees"
-            why = f"expected at least three distinct shifts, found {found}"
+            text = f"{np.degrees(shifts).tolist()} degrees"
+            why = f"expected at least three distinct shifts, found {text}"
             fix = "correct tof_permutation.npy, or the shifts in capture.json"
             raise InputError("phase shifts", where=where, why=why, fix=fix)
         groups.append(frames.tolist())
@@ -149,8 +149,8 @@ def largest_amplitude(sequence: Sequence) -> float:
         InputError: If no quartet is complete, or none has light.
     """
     quartets, where = sequence.complete_quartets, sequence.path or "sequence"
-    found = (phasor for i in quartets for _, phasor in quartet_phasors(sequence, i))
-    largest = max((float(np.hypot(*phasor).max()) for phasor in found), default=0.0)
+    phasors = (phasor for i in quartets for _, phasor in quartet_phasors(sequence, i))
+    largest = max((float(np.hypot(*phasor).max()) for phasor in phasors), default=0.0)
     if not largest > 0.0:
         what = "no light" if quartets else "no complete quartet"
         why = "expected all raw frames of a cycle, with light, found "

@@ -115,8 +115,8 @@ def read_parts(path: str | Path) -> Parts:
     parts = _read(path, PARTS_MAX)
     types = {image.dtype for channels in parts.values() for image in channels.values()}
     if types - TYPES:
-        found = ", ".join(map(str, types - TYPES))
-        raise _unreadable(path, PARTS_MAX, f"{found} instead of float32")
+        names = ", ".join(map(str, types - TYPES))
+        raise _unreadable(path, PARTS_MAX, f"{names} instead of float32")
     return parts
 
 
@@ -202,9 +202,9 @@ def _silence() -> Iterator[None]:
             sys.stdout = before
 
 
-def _unreadable(path: Path, parts_max: int, found: str) -> InputError:
+def _unreadable(path: Path, parts_max: int, actual: str) -> InputError:
     count = "one whole OpenEXR part" if parts_max == 1 else "whole OpenEXR parts"
-    why = f"expected {count} of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {found}"
+    why = f"expected {count} of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {actual}"
     fix = "copy or export the file again"
     return InputError("unreadable picture", where=path, why=why, fix=fix)
 

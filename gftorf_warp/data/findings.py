@@ -83,16 +83,16 @@ def frequencies(sequence: Sequence, report: Report) -> None:
 
 def constant_part(sequence: Sequence, report: Report) -> None:
     """Constant part of raw quads: an additive zero, or a multiple of the amplitude."""
-    found, used = constant.constant_part(sequence), sequence.calibration
-    text = f"{found.size:.2g} of the amplitude: additive {found.zero:.4g} explains "
-    text += f"{found.explained(found.left_by_zero):.0%}, dc_offset {found.dc_offset:.4f} "
-    text += f"{found.explained(found.left_by_dc):.0%}; in use is dc_offset {used.dc_offset:g}"
+    part, used = constant.constant_part(sequence), sequence.calibration
+    text = f"{part.size:.2g} of the amplitude: additive {part.zero:.4g} explains "
+    text += f"{part.explained(part.left_by_zero):.0%}, dc_offset {part.dc_offset:.4f} "
+    text += f"{part.explained(part.left_by_dc):.0%}; in use is dc_offset {used.dc_offset:g}"
     report.add("constant part", text)
-    if not found.is_explained:
+    if not part.is_explained:
         report.warn(
             "constant part",
-            f"dc_offset {used.dc_offset:g} leaves {found.left:.2g} of the amplitude: "
-            f"{found.advice(sequence, report.form)}",
+            f"dc_offset {used.dc_offset:g} leaves {part.left:.2g} of the amplitude: "
+            f"{part.advice(sequence, report.form)}",
         )
 
 
@@ -139,9 +139,9 @@ def camera(sequence: Sequence, report: Report) -> None:
 def _places_of_poses(form: str) -> str:
     """Where poses are stored so that the format's reader takes them."""
     if form == "capture":
-        return specs.place(form, "pose")
+        return specs.location(form, "pose")
     names = ("tof_extrinsics", "poses") if form == "ftorf" else ("tof_extrinsics",)
-    return " and ".join(specs.place(form, name) for name in names)
+    return " and ".join(specs.location(form, name) for name in names)
 
 
 def phasors(sequence: Sequence, report: Report) -> None:

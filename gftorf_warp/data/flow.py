@@ -1,10 +1,10 @@
 """Optical flow between raw frames of one shift, a cycle apart, for recordings without flow.
 
 Frames n and n + K have the same shift and frequency, K being the raw frames of a cycle, so a moving
-surface looks nearly alike in both. The flow of quartet start n is the median over the pairs n + j
-that start at most half a cycle away: pair n + j shows the surface a little earlier or later, at x +
-s F(x), s being its time from n in units of the pair's length. Pairs of different shifts have their
-weak contrast at different distances, and their noise is independent.
+surface has nearly the same contrast in both. The flow of quartet start n is the median over the
+pairs n + j that start at most half a cycle away: pair n + j shows the surface a little earlier or
+later, at x + s F(x), s being its time from n in units of the pair's length. Pairs of different
+shifts have their weak contrast at different distances, and their noise is independent.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis", every: int | Non
 
     # OpenCV releases Python's lock
     with ThreadPoolExecutor(thread_name_prefix="gftorf-flow") as threads:
-        found = dict(zip(pairs, threads.map(matched, pairs), strict=True))
+        by_pair = dict(zip(pairs, threads.map(matched, pairs), strict=True))
 
         def combined(k: int, first: int, step: int) -> dict[int, np.ndarray]:
             raw, reliable = (
-                {n + first: flows[i] for n, flows in found.items()} for i in (k, k + 2)
+                {n + first: flows[i] for n, flows in by_pair.items()} for i in (k, k + 2)
             )
             starts = [n for n in range(0, sequence.frames, every or sequence.cycle) if n in raw]
             flows = threads.map(lambda n: median_flow(n, raw, reliable, times, step), starts)

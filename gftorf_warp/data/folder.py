@@ -35,17 +35,17 @@ def format_of(path: Path) -> str:
         InputError: If it is neither; points to a sequence one level up or down, if there is one.
     """
 
-    def error(what: str, found: str, fix: str = "check the path") -> InputError:
-        return InputError(what, where=path, why=f"{EXPECTED}, found {found}", fix=fix)
+    def error(what: str, actual: str, fix: str = "check the path") -> InputError:
+        return InputError(what, where=path, why=f"{EXPECTED}, found {actual}", fix=fix)
 
     if not path.exists():
         raise error("no such folder", "nothing")
     if not path.is_dir():
         refuse_archive(path)
         raise error("not a folder", "a file")
-    found = format_or_none(path)
-    if found is not None:
-        return found
+    form = format_or_none(path)
+    if form is not None:
+        return form
     if (path / UNFINISHED).is_file():
         files = "files of an interrupted `gftorf simulate`"
         raise error("an unfinished recording", files, "repeat that command, which continues")
@@ -80,8 +80,8 @@ def numbered(root: Path, pattern: str) -> dict[int, Path]:
     matcher = re.compile(rf"{re.escape(before)}({digits}){re.escape(after)}")
     if not (root / folder).is_dir():
         return {}
-    found = ((matcher.fullmatch(entry.name), entry) for entry in (root / folder).iterdir())
-    return dict(sorted((int(match[1]), entry) for match, entry in found if match))
+    matches = ((matcher.fullmatch(entry.name), entry) for entry in (root / folder).iterdir())
+    return dict(sorted((int(match[1]), entry) for match, entry in matches if match))
 
 
 def refuse_absurd_ids(files: dict[int, Path]) -> None:

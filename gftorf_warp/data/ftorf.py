@@ -121,8 +121,8 @@ def _permutation(sequence: Sequence) -> np.ndarray:
     if gap.min(axis=1).max() > SHIFT_TOLERANCE or not one_each:
         expected = "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in "
         expected += "every quartet"
-        found = f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames"
-        raise inexpressible(FORMAT, "phase shifts", expected, found)
+        actual = f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames"
+        raise inexpressible(FORMAT, "phase shifts", expected, actual)
     # of a recording shorter than a quartet
     unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))
     return np.argsort([next(iter(slot)) if slot else next(unused) for slot in slots])

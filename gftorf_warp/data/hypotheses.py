@@ -83,9 +83,9 @@ class Hypothesis:
         if form == "ftorf":
             turns = np.round(2.0 * self.shifts / math.pi).astype(int) % FRAMES_PER_QUARTET
             channel = np.array([0, 2, 1, 3])[turns]  # of a shift of 0, 90, 180, 270 degrees
-            stated = specs.place(form, "permutation")
+            stated = specs.location(form, "permutation")
             return f"{stated} = {np.argsort(channel).tolist()}, {degrees}"
-        return f"{specs.place(form, 'shift')}, {degrees}"
+        return f"{specs.location(form, 'shift')}, {degrees}"
 
     def beats(self, stated: Hypothesis) -> bool:
         """Whether the evidence for it, instead of what is stated, is more than noise."""
@@ -101,8 +101,8 @@ def hypotheses(sequence: Sequence) -> list[Hypothesis]:
     """All hypotheses, that of the recording first, then the others, best first."""
     slots = _slots(sequence)
     stated, images = sequence.shifts[slots], _instants(sequence, slots)
-    found = [_judged(sequence, images, stated, order) for order in _orders(len(slots))]
-    return [found[0], *sorted(found[1:], key=lambda one: one.score)]
+    judged = [_judged(sequence, images, stated, order) for order in _orders(len(slots))]
+    return [judged[0], *sorted(judged[1:], key=lambda one: one.score)]
 
 
 def stated_pairs(sequence: Sequence) -> Pairs | None:

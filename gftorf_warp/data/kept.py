@@ -15,7 +15,7 @@ T = TypeVar("T")
 def kept(function: Callable[P, T]) -> Callable[P, T]:
     """Cache a function of a sequence and of further hashable arguments, all given by position.
 
-    Its results must not refer to the sequence, and nobody may change them.
+    Its results must not refer to the sequence and must not be changed.
     """
     results: weakref.WeakKeyDictionary[Any, dict[tuple, T]] = weakref.WeakKeyDictionary()
 

@@ -39,20 +39,20 @@ def read_matrix(data: bytes, name: str | None, *, unpacked_max: int = UNPACKED_M
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
         raise ValueError("no MATLAB 5 header")
     order = "<" if data[126:128] == b"IM" else ">"
-    found, only = [], None
+    names, only = [], None
     for stored in _elements(data[128:], order):
         packed = stored[0] == COMPRESSED
         inner = _elements(_unpacked(stored[1], unpacked_max), order) if packed else iter([stored])
         kind, content = next(inner, (0, b""))
         if kind == MATRIX:
             parts = list(_elements(content, order))
-            found.append(parts[2][1].decode("ascii", "replace") if len(parts) > 2 else "")
-            if found[-1] == name:
+            names.append(parts[2][1].decode("ascii", "replace") if len(parts) > 2 else "")
+            if names[-1] == name:
                 return _matrix(parts, order)
             only = parts
-    if name is not None or only is None or len(found) > 1:
+    if name is not None or only is None or len(names) > 1:
         expected = "one variable" if name is None else f"variable {name!r}"
-        raise ValueError(f"no {expected} but {found}")
+        raise ValueError(f"no {expected} but {names}")
     return _matrix(only, order)
 
 
@@ -66,8 +66,8 @@ def _matrix(parts: list[tuple[int, bytes]], order: str) -> np.ndarray:
     shape = struct.unpack(f"{order}{axes}i", parts[1][1])
     kind, values = parts[3]
     if flags & 0xFF not in CLASSES or flags & COMPLEX or kind not in NUMBERS or min(shape) < 1:
-        found = f"class {flags & 0xFF}, type {kind}, size {shape}"
-        raise ValueError(f"{found} is no matrix of real numbers")
+        text = f"class {flags & 0xFF}, type {kind}, size {shape}"
+        raise ValueError(f"{text} is no matrix of real numbers")
     stored = np.dtype(order + NUMBERS[kind])
     if len(values) != math.prod(shape) * stored.itemsize:
         raise ValueError(f"{len(values)} bytes for {shape} numbers of {stored}")

@@ -26,7 +26,7 @@ WRAPPED_SHARE = 2.5e-3
 
 
 def phase(sequence: Sequence, report: Report) -> None:
-    """Order, then offset, then wraps: each can look like the next, and is reported alone."""
+    """Order, then offset, then wraps: each can be mistaken for the next, and is reported alone."""
     for rule in (order, offset, wraps):
         before = len(report.findings)
         rule(sequence, report)
@@ -73,11 +73,11 @@ def _noise(sequence: Sequence) -> float:
 
 def offset(sequence: Sequence, report: Report) -> None:
     """Phase offset, by the fall-off of the amplitude."""
-    found = offset_by_falloff(sequence)
-    if found is None:
+    fit = offset_by_falloff(sequence)
+    if fit is None:
         report.add("fall-off", "too few pixels on one surface")
         return
-    best, measure, stated = found
+    best, measure, stated = fit
     used = sequence.calibration.phase_offset
     text = f"{stated:.3f} with phase_offset {used:.3g}, least {measure:.3f} with {best:+.2f} rad"
     report.add("fall-off", f"{text}; 1 is none, see docs/check.md")

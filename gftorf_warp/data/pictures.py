@@ -43,8 +43,8 @@ def read_picture(path: Path) -> np.ndarray:
     sizes = [_png_size(path, data)] if data.startswith(PNG) else _tiff_sizes(path, data)
     within = all(1 <= side <= SIDE_MAX for size in sizes for side in size)
     if not within or len(sizes) > FRAMES_MAX:
-        found = f"{len(sizes)} pages, the first of {sizes[0]}"
-        raise unreadable(path, f"expected 1 to {SIDE_MAX} pixels a side, found {found}")
+        text = f"{len(sizes)} pages, the first of {sizes[0]}"
+        raise unreadable(path, f"expected 1 to {SIDE_MAX} pixels a side, found {text}")
     if data.startswith(PNG):
         _check_sums(path, data)
     try:
@@ -56,8 +56,8 @@ def read_picture(path: Path) -> np.ndarray:
         raise unreadable(path, str(error).splitlines()[0][:200]) from error
     shapes = {(page.shape, page.dtype) for page in pages}
     if not done or len(pages) != len(sizes) or len(shapes) != 1:
-        found = f"{len(pages)} of them, of shapes {sorted(map(str, shapes))}"
-        raise unreadable(path, f"expected {len(sizes)} whole pages of one shape, found {found}")
+        text = f"{len(pages)} of them, of shapes {sorted(map(str, shapes))}"
+        raise unreadable(path, f"expected {len(sizes)} whole pages of one shape, found {text}")
     images = np.stack(pages)
     if images.ndim == 4 and images.shape[-1] in (3, 4):  # OpenCV keeps blue first
         images = images[..., [2, 1, 0, *range(3, images.shape[-1])]]
@@ -107,13 +107,13 @@ def _tiff_sizes(path: Path, data: bytes) -> list[tuple[int, int]]:
                 raise ValueError("its directories form a circle")
             seen.add(start)
             count = struct.unpack_from(f"{order}H", data, start)[0]
-            found = {}
+            sides = {}
             for entry in range(start + 2, start + 2 + 12 * count, 12):
                 tag, kind, _ = struct.unpack_from(f"{order}HHI", data, entry)
                 if tag in (WIDTH_TAG, HEIGHT_TAG) and kind in TAG_FORMATS:
                     form = f"{order}{TAG_FORMATS[kind]}"
-                    found[tag] = struct.unpack_from(form, data, entry + 8)[0]
-            sizes.append((found.get(WIDTH_TAG, 0), found.get(HEIGHT_TAG, 0)))
+                    sides[tag] = struct.unpack_from(form, data, entry + 8)[0]
+            sizes.append((sides.get(WIDTH_TAG, 0), sides.get(HEIGHT_TAG, 0)))
             start = struct.unpack_from(f"{order}I", data, start + 2 + 12 * count)[0]
     except (struct.error, ValueError) as error:
         raise unreadable(path, f"expected the directories of a TIFF file, found {error}") from error

@@ -34,18 +34,18 @@ def interpolated(
     """
     import cv2
 
-    found = np.empty((len(times), 4, 4))
+    result = np.empty((len(times), 4, 4))
     after = np.clip(np.searchsorted(stamps, times, side="right"), 1, max(1, len(stamps) - 1))
     for n, (time, k) in enumerate(zip(times, after, strict=True)):
         before, other = poses[k - 1], poses[min(k, len(stamps) - 1)]
         span = stamps[min(k, len(stamps) - 1)] - stamps[k - 1]
         share = float(np.clip((time - stamps[k - 1]) / span, 0.0, 1.0)) if span > 0 else 0.0
         turn = cv2.Rodrigues(before[:3, :3].T @ other[:3, :3])[0]
-        found[n] = before
+        result[n] = before
         if share > 0:
-            found[n, :3, :3] = before[:3, :3] @ cv2.Rodrigues(share * turn)[0]
-            found[n, :3, 3] = (1 - share) * before[:3, 3] + share * other[:3, 3]
-    return found
+            result[n, :3, :3] = before[:3, :3] @ cv2.Rodrigues(share * turn)[0]
+            result[n, :3, 3] = (1 - share) * before[:3, 3] + share * other[:3, 3]
+    return result
 
 
 def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
@@ -149,11 +149,11 @@ def read_novel(root: Path, form: str, sources: dict[str, str]) -> np.ndarray | N
         InputError: If they are no rigid motions.
     """
     spec = specs.fields(form)["test_poses"]
-    found = read_stored(root, spec)
-    if found is None:
+    stored_poses = read_stored(root, spec)
+    if stored_poses is None:
         sources["novel_from_world"] = "default none"
         return None
-    stored, name = found[0][:, :, :4].astype(np.float64), found[1]
+    stored, name = stored_poses[0][:, :, :4].astype(np.float64), stored_poses[1]
     poses = _identity(len(stored))
     poses[:, : stored.shape[1]] = stored
     _refuse_others(root / name, spec.name, poses)

@@ -29,8 +29,8 @@ def read(
         InputError: If the folder or a file in it does not conform to data_specs/, or there are no
             such raw frames.
     """
-    found = _read(Path(path), frame_rate_hz, frames)
-    return found if frames is None else excerpt(found, frames, quads=found.quads)
+    sequence = _read(Path(path), frame_rate_hz, frames)
+    return sequence if frames is None else excerpt(sequence, frames, quads=sequence.quads)
 
 
 def read_without_images(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:

@@ -97,10 +97,10 @@ def _scale(sequence: Sequence, report: Report, pairs: list[tuple[int, int]]) -> 
 
 def _pairs(sequence: Sequence) -> list[tuple[int, int]]:
     """Quartets far from each other in time."""
-    own = sequence.complete_quartets
-    if len(own) < 2:
+    quartets = sequence.complete_quartets
+    if len(quartets) < 2:
         return []
-    first, quarter, half, last = (own[k * (len(own) - 1) // 4] for k in (0, 1, 2, 4))
+    first, quarter, half, last = (quartets[k * (len(quartets) - 1) // 4] for k in (0, 1, 2, 4))
     pairs = {(first, half), (first, last), (half, last), (quarter, last)}
     return sorted(pair for pair in pairs if pair[0] != pair[1])
 
@@ -109,8 +109,8 @@ def _difference(
     sequence: Sequence, poses: Poses, pairs: list[tuple[int, int]], scale: float = 1.0
 ) -> Difference:
     """Mean over pairs, if distances are multiplied by ``scale``."""
-    found = [_of_pair(sequence, poses, i, j, scale) for i, j in pairs]
-    return Difference(*np.mean(found, axis=0).tolist())
+    differences = [_of_pair(sequence, poses, i, j, scale) for i, j in pairs]
+    return Difference(*np.mean(differences, axis=0).tolist())
 
 
 def _of_pair(sequence: Sequence, poses: Poses, i: int, j: int, scale: float) -> Difference:
@@ -131,12 +131,12 @@ def _of_pair(sequence: Sequence, poses: Poses, i: int, j: int, scale: float) -> 
     if inside.sum() < OVERLAP_MIN * len(points):
         return Difference(distance=CAP, reflectivity=CAP_LOG)
     at = x[inside, None].astype(np.float32), y[inside, None].astype(np.float32)
-    found, texture = (
+    measured, texture = (
         cv2.remap(image.astype(np.float32), *at, cv2.INTER_LINEAR)[:, 0]
         for image in (scale * closed_form_distance(sequence, j), _log_reflectivity(sequence, j))
     )
     expected = np.linalg.norm(points[front][inside], axis=1)
-    apart = np.minimum(np.abs(found / expected - 1.0), CAP)
+    apart = np.minimum(np.abs(measured / expected - 1.0), CAP)
     other = np.minimum(np.abs(texture - reflectivity[front][inside]), CAP_LOG)
     return Difference(distance=float(np.median(apart)), reflectivity=float(other.mean()))
 

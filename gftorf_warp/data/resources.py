@@ -171,7 +171,7 @@ def _of_control_group() -> float | None:
     """Limit minus use of control groups of version 2 or 1, without files that may be dropped: the
     least of this process's group and all that it is in.
     """
-    found = []
+    margins = []
     for base, most, used in (
         (CGROUP, "memory.max", "memory.current"),
         (CGROUP / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
@@ -180,8 +180,8 @@ def _of_control_group() -> float | None:
             limit, use = _number(folder / most), _number(folder / used)
             if limit is not None and use is not None:
                 dropped = _table(folder / "memory.stat").get("inactive_file", 0)
-                found.append(limit - use + dropped)
-    return min(found, default=None)
+                margins.append(limit - use + dropped)
+    return min(margins, default=None)
 
 
 def _groups_below(base: Path) -> set[Path]:

@@ -67,10 +67,10 @@ def fields(name: str) -> dict[str, Field]:
     }
 
 
-def place(name: str, field: str) -> str:
+def location(name: str, field: str) -> str:
     """Where a format states a value, for messages: ``KEY in capture.json``, or the best file."""
-    found = fields(name)[field]
-    return f"{found.key} in {found.paths[0]}" if found.kind == "json" else found.paths[0]
+    spec = fields(name)[field]
+    return f"{spec.key} in {spec.paths[0]}" if spec.kind == "json" else spec.paths[0]
 
 
 def layer_field(name: str) -> Field:

@@ -49,7 +49,7 @@ LEAST = 1e-12  # [1] a target with less weight got nothing
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Synchronised:
-    """A cycle as it would look at one instant."""
+    """A cycle as if all of its raw frames were of one instant."""
 
     sequence: Sequence
     """One quartet of K raw frames, all with the time and the pose of that instant."""
@@ -215,9 +215,9 @@ def _by_quads(sequence: Sequence, slot: int, time: float, method: Method) -> lis
 def _by_taps(sequence: Sequence, slot: int, time: float, method: Method) -> list[Source]:
     """The same with the flow of tap sums to the raw frame nearest to the time."""
     times, sums = sequence.times, sequence.tap_sums
-    own = [n for n in sorted(sums) if (n - slot) % sequence.cycle == 0]
-    before = [n for n in own if times[n] <= time][-1:]
-    after = [n for n in own if times[n] > time][:1]
+    of_slot = [n for n in sorted(sums) if (n - slot) % sequence.cycle == 0]
+    before = [n for n in of_slot if times[n] <= time][-1:]
+    after = [n for n in of_slot if times[n] > time][:1]
     apart = sum(times[n] for n in after) - sum(times[n] for n in before)
     sources = []
     for n in before + after:
@@ -269,5 +269,5 @@ def _mismatch(
 ) -> Float[np.ndarray, "H W"]:
     """Difference of the source to the target at the end of its flow, over the range of both [1]."""
     low, high = optical_flow.brightness_range(source, target)
-    found = sample(target[None], flow.astype(np.float32))[0].astype(np.float64)
-    return np.abs(found - source) / (high - low) if high > low else np.zeros(source.shape)
+    sampled = sample(target[None], flow.astype(np.float32))[0].astype(np.float64)
+    return np.abs(sampled - source) / (high - low) if high > low else np.zeros(source.shape)

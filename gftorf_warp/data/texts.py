@@ -48,8 +48,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
             break
         row = _loads(line)
         if not _is_row(row):
-            found = repr(line[:80].strip())
-            why = f"expected an object of images and other numbers in line {number}, found {found}"
+            text = repr(line[:80].strip())
+            why = f"expected an object of images and other numbers in line {number}, found {text}"
             raise InputError("not a row", where=path, why=why, fix="remove that line")
         rows.append(row)
     return rows

@@ -53,13 +53,13 @@ def refuse_archive(path: Path) -> None:
             head = file.read(TAR_AT + len(TAR))
     except OSError as error:
         raise unreadable(path, error.strerror or str(error)) from error
-    found = next((name for magic, name in ARCHIVES.items() if head.startswith(magic)), None)
+    archive = next((name for magic, name in ARCHIVES.items() if head.startswith(magic)), None)
     if head[TAR_AT:] == TAR:
-        found = "tar"
+        archive = "tar"
     if head.startswith((GZIP, BZIP2)) and path.suffix.lower() in (".gz", ".tgz", ".bz2", ".tbz2"):
-        found = "gzip" if head.startswith(GZIP) else "bzip2"
-    if found is not None:
-        why = f"expected the recording itself, found a {found} archive: nothing is unpacked here"
+        archive = "gzip" if head.startswith(GZIP) else "bzip2"
+    if archive is not None:
+        why = f"expected the recording itself, found a {archive} archive: nothing is unpacked here"
         fix = "unpack it into a folder of its own and give that, or the file in it"
         raise InputError("an archive", where=path, why=why, fix=fix)
 
@@ -103,8 +103,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         InputError: If it is no file, too large, or cannot be read.
     """
     if not path.is_file():  # opening a pipe would block
-        found = "a folder" if path.is_dir() else "a pipe or a device" if path.exists() else "none"
-        raise unreadable(path, f"expected a file, found {found}")
+        kind = "a folder" if path.is_dir() else "a pipe or a device" if path.exists() else "none"
+        raise unreadable(path, f"expected a file, found {kind}")
     try:
         size = path.stat().st_size
         if most is not None and size > most:

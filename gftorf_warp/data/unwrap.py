@@ -49,10 +49,12 @@ def multiples(frequencies_hz: Sequence[float]) -> tuple[tuple[int, ...], float]:
     first = frequencies_hz[0]
     ratios = [Fraction(1), *(_ratio(f, first, listed) for f in frequencies_hz[1:])]
     scale = math.lcm(*(ratio.denominator for ratio in ratios))
-    found = tuple(int(ratio * scale) for ratio in ratios)
-    if len(set(found)) < len(found):
+    integers = tuple(int(ratio * scale) for ratio in ratios)
+    if len(set(integers)) < len(integers):
         raise _incommensurate(listed)
-    return found, sum(f / m for f, m in zip(frequencies_hz, found, strict=True)) / len(found)
+    return integers, sum(f / m for f, m in zip(frequencies_hz, integers, strict=True)) / len(
+        integers
+    )
 
 
 def _ratio(one_hz: float, other_hz: float, listed: str) -> Fraction:

@@ -112,9 +112,9 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         UsageError: If not.
     """
 
-    def require(holds: object, what: str, expected: str, found: object) -> None:
+    def require(holds: object, what: str, expected: str, actual: object) -> None:
         if not holds:
-            raise inexpressible(form, what, expected, str(found))
+            raise inexpressible(form, what, expected, str(actual))
 
     stated, tof, times = sequence.calibration, sequence.intrinsics, sequence.times
     if form in ("ftorf", "torf"):  # these state one depth range and one matrix
@@ -139,7 +139,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     require(scale is None or scale > 0, "quad_scale", "above 0", scale)
     colour = _colour_intrinsics(sequence)
     numbers = (colour.fx, colour.fy, colour.cx, colour.cy)
-    for what, camera, width, found, known in (
+    for what, camera, width, actual, known in (
         ("focal length", tof, sequence.width, (tof.fx, tof.fy), True),
         (
             "colour_intrinsics",
@@ -150,7 +150,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         ),
     ):
         holds = known and min(camera.fx, camera.fy) >= FOCAL_MIN * width
-        require(holds, what, f"pixels, at least {FOCAL_MIN} of the width {width}", found)
+        require(holds, what, f"pixels, at least {FOCAL_MIN} of the width {width}", actual)
     images = sequence.colour.images.values()
     require(all(np.isfinite(image).all() for image in images), "colour", finite, infinite)
     flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
@@ -176,12 +176,12 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         require(holds, what, "rotations and translations", "other matrices")
 
 
-def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError:
+def inexpressible(form: str, what: str, expected: str, actual: str) -> UsageError:
     """The error for values that a format cannot store."""
     return UsageError(
         f"{what}: the {form} format cannot hold this",
         where=f"format {form}",
-        why=f"expected {expected}, found {found}",
+        why=f"expected {expected}, found {actual}",
         fix="change the sensor or the sequence",
     )
 
