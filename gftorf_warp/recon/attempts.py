@@ -74,17 +74,17 @@ def run(
     """
     while True:
         state = train(state)
-        found = judge()
+        residuals = judge()
         if state.other is not None:
-            if not _keep_better(state, _judged(state.attempt, found, settings), out):
-                return state, found
+            if not _keep_better(state, _judged(state.attempt, residuals, settings), out):
+                return state, residuals
             return _restored(state, out), judge()
-        why = failures(found.as_json() if found else None)
+        why = failures(residuals.as_json() if residuals else None)
         if not why or len(state.judged) + 1 >= settings.attempts_max:
-            return state, found
+            return state, residuals
         if settings.schedule.images < JUDGED_FROM:
-            return state, found
-        ended, judged = state, _judged(state.attempt, found, settings)
+            return state, residuals
+        ended, judged = state, _judged(state.attempt, residuals, settings)
         state = begin(ended.attempt + 1)
         state.attempt = ended.attempt + 1
         state.other = {"stored": to_dict(ended), "rows": _rows(out)}
@@ -109,15 +109,15 @@ def conclude(
     out: Path,
     config: dict[str, Any],
     state: Mapping[str, Any],
-    found: Residuals | None,
+    residuals: Residuals | None,
 ) -> None:
     """Write what config.json says of a finished run, by its state and residuals at the end."""
     config |= {"seconds_reconstruct": state["seconds"], "images_optimised": state["images"]}
     config |= {name: state[name] for name in ("skipped", "restarts", "revivals") if name in state}
     if state.get("judged"):
         config["attempts"] = _as_json(state["judged"], state["attempt"])
-    warn(found)
-    folder.write_config(out, config | {"explained": found and found.as_json()})
+    warn(residuals)
+    folder.write_config(out, config | {"explained": residuals and residuals.as_json()})
 
 
 def _as_json(judged: list[Judged], kept: int) -> list[Judged]:
@@ -125,12 +125,12 @@ def _as_json(judged: list[Judged], kept: int) -> list[Judged]:
     return [{**one, "kept": one["attempt"] == kept} for one in judged]
 
 
-def _judged(number: int, found: Residuals | None, settings: ReconSettings) -> Judged:
+def _judged(number: int, residuals: Residuals | None, settings: ReconSettings) -> Judged:
     """An attempt that ended, and what its residuals say."""
-    explained = found.as_json() if found else {}
+    explained = residuals.as_json() if residuals else {}
     names = ("unexplained_share", "changing_unexplained_share", "contradicted_share")
     shares = {name: explained.get(name) for name in names}
-    chi_square = float(found.chi_square.mean(dtype=float)) if found else math.inf
+    chi_square = float(residuals.chi_square.mean(dtype=float)) if residuals else math.inf
     known = chi_square if math.isfinite(chi_square) else None
     start = _start(settings, number)
     return {"attempt": number, "start": start, "mean_chi_square": known, **shares}

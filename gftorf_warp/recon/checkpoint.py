@@ -41,12 +41,12 @@ def save(run: Path, stored: dict) -> Path:
         ResourceError: If the disk is full.
         InputError: If what came back from the disk is not what was written.
     """
-    place = folder(run)
-    place.mkdir(exist_ok=True)
+    checkpoints = folder(run)
+    checkpoints.mkdir(exist_ok=True)
     buffer = io.BytesIO()
     torch.save(stored, buffer)
     data = buffer.getvalue()
-    path = place / f"{_name(int(stored['images']))}.pt"
+    path = checkpoints / f"{_name(int(stored['images']))}.pt"
     _write(path, data)
     _read(path)
     behind = [other for other in _paths(run) if other <= path]
@@ -86,12 +86,16 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict:
             why=f"expected tensors and plain values only, found {_foreign(error)}",
             fix="use a checkpoint of this run, or start over with --fresh",
         ) from error
-    found = stored.get("format") if isinstance(stored, dict) else None
-    if not isinstance(found, int) or found > FORMAT or not isinstance(stored.get("images"), int):
+    version = stored.get("format") if isinstance(stored, dict) else None
+    if (
+        not isinstance(version, int)
+        or version > FORMAT
+        or not isinstance(stored.get("images"), int)
+    ):
         raise InputError(
             "checkpoint of another format",
             where=path,
-            why=f"this version reads formats up to {FORMAT}, found {found}",
+            why=f"this version reads formats up to {FORMAT}, found {version}",
             fix="update gftorf_warp, or start over with --fresh",
         )
     return stored
@@ -111,9 +115,9 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
     for path in reversed(_stated_paths(run)):
         try:
             stored = load(path, device)
-        except InputError as found:
-            LOG.warning("%s: %s: %s", found.where, found.what, found.why)
-            error = error or found
+        except InputError as failure:
+            LOG.warning("%s: %s: %s", failure.where, failure.what, failure.why)
+            error = error or failure
             continue
         if error is not None:
             _go_back(stored, error)
@@ -256,12 +260,12 @@ def _read(path: Path) -> bytes:
         data, stated = read_bytes(path), _stated(path)
     except InputError as error:
         raise InputError("damaged checkpoint", where=path, why=error.why, fix=fix) from error
-    found = hashlib.sha256(data).hexdigest()
+    actual = hashlib.sha256(data).hexdigest()
     if not stated:
         why = f"{sidecar.name} beside it, which holds its SHA-256, is missing or empty"
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
-    if found not in stated:
-        why = f"its SHA-256 is {found[:12]}..., {sidecar.name} beside it says {stated[0][:12]}..."
+    if actual not in stated:
+        why = f"its SHA-256 is {actual[:12]}..., {sidecar.name} beside it says {stated[0][:12]}..."
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
     return data
 

@@ -2,7 +2,7 @@
 reconstruction.
 
 Every quartet is decoded as if its raw frames had been taken at once (method, sections 2.9 and 7,
-row ``ctof``). Nothing was fitted, so there is one distance per quartet and one place to look from.
+row ``ctof``). Nothing was fitted, so there is one distance per quartet and one viewpoint.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def rendering_of(
     )
 
 
-def row_of(sequence: Sequence, time: float, camera: Camera, own: Camera) -> int | None:
+def row_of(sequence: Sequence, time: float, camera: Camera, sequence_camera: Camera) -> int | None:
     """Which complete quartet, counted from 0, a time [s] is in, seen from the sequence's own
     camera; None outside of them, and for another camera.
     """
@@ -68,12 +68,12 @@ def row_of(sequence: Sequence, time: float, camera: Camera, own: Camera) -> int 
     times = sequence.times[sequence.quartet_frames(quartet)]
     if not times[0] - TIME_S <= time <= times[-1] + TIME_S:
         return None
-    if another_view(sequence, time, camera, own):
+    if another_view(sequence, time, camera, sequence_camera):
         return None
     return sequence.complete_quartets.index(quartet)
 
 
-def another_view(sequence: Sequence, time: float, camera: Camera, own: Camera) -> str:
+def another_view(sequence: Sequence, time: float, camera: Camera, sequence_camera: Camera) -> str:
     """How a camera differs from that of the sequence at a time [s], in words; empty if it does
     not.
     """
@@ -83,20 +83,26 @@ def another_view(sequence: Sequence, time: float, camera: Camera, own: Camera) -
         np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
     )
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    differ = [name for name in names if not math.isclose(getattr(camera, name), getattr(own, name))]
+    differ = [
+        name
+        for name in names
+        if not math.isclose(getattr(camera, name), getattr(sequence_camera, name))
+    ]
     if differ:
         return ", ".join(differ)
     return f"pose, {apart:.3g} away from that of the quartet" if apart > POSE_TOLERANCE else ""
 
 
-def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, where: Path) -> None:
+def check_camera(
+    sequence: Sequence, time: float, camera: Camera, sequence_camera: Camera, where: Path
+) -> None:
     """Refuse every camera but the sequence's own.
 
     Raises:
-        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the
-            quartet.
+        UsageError: If ``camera`` has other intrinsics than ``sequence_camera``, or a pose far
+            from those of the quartet.
     """
-    if differs := another_view(sequence, time, camera, own):
+    if differs := another_view(sequence, time, camera, sequence_camera):
         raise UsageError(
             "a closed form has one view",
             where=where,

@@ -104,9 +104,9 @@ def save(
         binding=binding,
         statistics=densify.start(field),
     )
-    with atomic_folder(out) as place:
-        folder.write_config(place, {**config, EDITED: str(run.resolve())})
-        checkpoint.save(place, to_dict(state))
+    with atomic_folder(out) as partial:
+        folder.write_config(partial, {**config, EDITED: str(run.resolve())})
+        checkpoint.save(partial, to_dict(state))
 
 
 def check_finite(run: Path, field: GaussianField, motion: Motion) -> None:

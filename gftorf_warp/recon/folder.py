@@ -85,7 +85,7 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
     A setting that a run is too old to know has its default: what it says then is what was always
     done, or as good.
     """
-    found = []
+    texts = []
     flat_old, flat_new = (
         {**_flat(c.get("settings", {})), **{k: c.get(k) for k in IDENTITY}} for c in (old, new)
     )
@@ -101,8 +101,8 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
         ):
             continue
         if before != after and key not in CHANGES_NOTHING:
-            found.append(f"{key} was {_short(before)}, now {_short(after)}")
-    return found
+            texts.append(f"{key} was {_short(before)}, now {_short(after)}")
+    return texts
 
 
 def set_aside(run: Path, held: list[Path]) -> Path:
@@ -110,11 +110,11 @@ def set_aside(run: Path, held: list[Path]) -> Path:
     number = 1
     while (run / f"old-{number}").exists():
         number += 1
-    place = run / f"old-{number}"
-    place.mkdir()
+    aside = run / f"old-{number}"
+    aside.mkdir()
     for path in held:
-        path.rename(place / path.name)
-    return place
+        path.rename(aside / path.name)
+    return aside
 
 
 def read_config(run: Path) -> dict[str, Any]:
@@ -134,11 +134,13 @@ def read_config(run: Path) -> dict[str, Any]:
         raise InputError("not a run", where=path, why="expected a JSON object", fix=fix)
     stated = config.pop(SUM, None)
     try:
-        found = None if stated is None else sum_of(config)
+        actual = None if stated is None else sum_of(config)
     except ValueError:  # a NaN or an infinity, which is never written
-        found = "not of JSON"
-    if stated != found:
-        why = f"the SHA-256 of its values is {str(found)[:12]}..., {SUM} says {str(stated)[:12]}..."
+        actual = "not of JSON"
+    if stated != actual:
+        why = (
+            f"the SHA-256 of its values is {str(actual)[:12]}..., {SUM} says {str(stated)[:12]}..."
+        )
         fix = f"restore it from a copy; if a value was changed on purpose, remove {SUM} from it"
         raise InputError("damaged config", where=path, why=why, fix=fix)
     return config

@@ -246,41 +246,43 @@ def _contradictions(
     return ~agrees, agrees & ~(apart <= np.maximum(far, SIGMAS * sigma))
 
 
-def warn(found: Residuals | None) -> None:
+def warn(judged: Residuals | None) -> None:
     """Log everything that :func:`problems` finds."""
-    for problem in problems(found.as_json() if found else None):
+    for problem in problems(judged.as_json() if judged else None):
         LOG.warning("%s", problem)
 
 
-def failures(found: Mapping[str, Any] | None) -> list[str]:
+def failures(explained: Mapping[str, Any] | None) -> list[str]:
     """Those of :func:`problems` by which a fit failed: all, unless only a few pixels are not
     explained.
     """
-    return problems(found, unexplained_max=FAILED_MIN)
+    return problems(explained, unexplained_max=FAILED_MIN)
 
 
 def problems(
-    found: Mapping[str, Any] | None, *, unexplained_max: float = UNEXPLAINED_MAX
+    explained: Mapping[str, Any] | None, *, unexplained_max: float = UNEXPLAINED_MAX
 ) -> list[str]:
     """What is wrong with a run, in sentences, from :meth:`Residuals.as_json`; the same limits for
     every preset. Opaque veils, dead networks, wrong or missing motion and layers at false distances
     all show here.
     """
-    if found is None:
+    if explained is None:
         return []
     sentences = []
-    if found["unexplained_share"] > unexplained_max:
-        text = f"the fit does not explain {found['unexplained_share']:.1%} of the pixels"
-        if found["reduced_chi_square"] is not None:
-            text += f" (reduced chi-square of the quads {found['reduced_chi_square']:.3g})"
-        ranges = {name: "{} to {}".format(*found[name]) for name in ("columns", "rows", "frames")}
+    if explained["unexplained_share"] > unexplained_max:
+        text = f"the fit does not explain {explained['unexplained_share']:.1%} of the pixels"
+        if explained["reduced_chi_square"] is not None:
+            text += f" (reduced chi-square of the quads {explained['reduced_chi_square']:.3g})"
+        ranges = {
+            name: "{} to {}".format(*explained[name]) for name in ("columns", "rows", "frames")
+        }
         text += f", most of them in columns {ranges['columns']}, rows {ranges['rows']}, "
         sentences.append(text + f"raw frames {ranges['frames']}")
-    if (found["changing_unexplained_share"] or 0.0) > CHANGING_MAX:
-        share = f"{found['changing_unexplained_share']:.1%} of the pixels that change over time"
+    if (explained["changing_unexplained_share"] or 0.0) > CHANGING_MAX:
+        share = f"{explained['changing_unexplained_share']:.1%} of the pixels that change over time"
         sentences.append(f"motion is missing or wrong: the fit does not explain {share}")
-    if (found["contradicted_share"] or 0.0) > CONTRADICTED_MAX:
-        share = f"{found['contradicted_share']:.1%} of the pixels where nothing changes"
+    if (explained["contradicted_share"] or 0.0) > CONTRADICTED_MAX:
+        share = f"{explained['contradicted_share']:.1%} of the pixels where nothing changes"
         sentences.append(f"the fitted distance contradicts the measured one in {share}")
     return sentences
 

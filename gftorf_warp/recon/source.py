@@ -1,4 +1,4 @@
-"""The sequence that a run was made from: read again, checked by its hash, found elsewhere."""
+"""The sequence that a run was made from: read again and checked by its hash."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def link(run: Path, config: Mapping[str, Any], source: str | Path) -> dict[str, 
 
 def remember(run: Path, source: Path) -> None:
     """Let config.json name the folder of the sequence."""
-    config, place = folder.read_config(run), str(source.resolve())
-    if config.get("sequence") != place:
-        folder.write_config(run, config | {"sequence": place})
+    config, path = folder.read_config(run), str(source.resolve())
+    if config.get("sequence") != path:
+        folder.write_config(run, config | {"sequence": path})
 
 
 def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
@@ -74,8 +74,8 @@ def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
     sequence = read(source, frame_rate_hz=rate, frames=frames)
     _check_hash(source, run, config, sequence)
     for number, stored in enumerate(config.get("windows") or ()):
-        own, part = folder_of(run, number), excerpt(sequence, Window.of(stored).frames)
-        _check_hash(source, own, folder.read_config(own), part)
+        window_run, part = folder_of(run, number), excerpt(sequence, Window.of(stored).frames)
+        _check_hash(source, window_run, folder.read_config(window_run), part)
     camera, size = config["camera"], (sequence.width, sequence.height)
     if (camera["width"], camera["height"]) != size:
         why = f"{run} has {camera['width']}x{camera['height']} pixels, this {size[0]}x{size[1]}"
@@ -87,8 +87,8 @@ def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
 def _check_hash(source: Path, run: Path, config: Mapping[str, Any], sequence: Sequence) -> None:
     """Raise an InputError if a sequence has another hash than the config of a run states."""
     wanted = config.get("data_sha256")
-    if wanted is not None and (found := data_hash(sequence)) != wanted:
-        why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {found[:12]}..."
+    if wanted is not None and (actual := data_hash(sequence)) != wanted:
+        why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {actual[:12]}..."
         fix = "name the sequence of the run with --sequence SEQ, or reconstruct this one"
         raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
 
@@ -101,9 +101,9 @@ def check_windows(run: Path, config: Mapping[str, Any]) -> None:
     """
     count = len(config["windows"])
     windows = [folder_of(run, number) for number in range(count)]
-    for done, own in enumerate([*windows, run]):
-        there = (own / folder.CONFIG).is_file()
-        if not there or folder.read_config(own).get("images_optimised") is None:
+    for done, path in enumerate([*windows, run]):
+        there = (path / folder.CONFIG).is_file()
+        if not there or folder.read_config(path).get("images_optimised") is None:
             why = f"the first {done} of {count} windows are finished"
             fix = "repeat its `gftorf reconstruct`, which goes on there"
-            raise InputError("the run is not finished", where=own, why=why, fix=fix)
+            raise InputError("the run is not finished", where=path, why=why, fix=fix)

@@ -243,6 +243,6 @@ def _gradients_of(
     if not values or not wanted:
         return [None] * len(leaves)
     loss = fused.sum_for_gradients(cotangents, values)
-    found = iter(torch.autograd.grad(loss, wanted, allow_unused=True))
-    gradients = [next(found) if leaf.requires_grad else None for leaf in leaves]
+    computed = iter(torch.autograd.grad(loss, wanted, allow_unused=True))
+    gradients = [next(computed) if leaf.requires_grad else None for leaf in leaves]
     return [None if gradient is None else gradient.contiguous() for gradient in gradients]

@@ -122,13 +122,13 @@ def _changed(changes: Iterable[str]) -> list[str]:
     return [f"changed: {', '.join(changes)}"] if changes else []
 
 
-def log_faithfulness(settings: ReconSettings, found: dict[str, list[str]]) -> None:
-    """Say in the log what :func:`faithfulness` found of a method that is not our renderer."""
+def log_faithfulness(settings: ReconSettings, statements: dict[str, list[str]]) -> None:
+    """Log what :func:`faithfulness` states of a method that is not our renderer."""
     if settings.method == Method.GAUSSIANS:
         return
-    for sentence in found.get("faithful", ()):
+    for sentence in statements.get("faithful", ()):
         LOG.info("%s, as published: %s", settings.preset, sentence)
-    for sentence in found.get("assumed", ()):
+    for sentence in statements.get("assumed", ()):
         LOG.info("%s, assumed or different: %s", settings.preset, sentence)
 
 
@@ -139,8 +139,8 @@ def about_preset(sequence: Sequence, settings: ReconSettings) -> str:
         InputError: If it cannot.
     """
     check_sequence(sequence, settings)
-    found = faithfulness(settings, ())
+    statements = faithfulness(settings, ())
     lines = [f"preset {settings.preset} can be applied to it"]
-    lines += [f"  as published    {sentence}" for sentence in found.get("faithful", ())]
-    lines += [f"  assumed         {sentence}" for sentence in found.get("assumed", ())]
+    lines += [f"  as published    {sentence}" for sentence in statements.get("faithful", ())]
+    lines += [f"  assumed         {sentence}" for sentence in statements.get("assumed", ())]
     return "\n".join(lines)

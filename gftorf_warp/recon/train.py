@@ -130,8 +130,8 @@ def chosen_settings(
         UsageError: If one of them is unknown or invalid.
     """
     if isinstance(settings, str):
-        found = input_of(sequence, _choice(Input, input, "--input"))
-        recorded = presets.Recorded.of(sequence, found)
+        resolved = input_of(sequence, _choice(Input, input, "--input"))
+        recorded = presets.Recorded.of(sequence, resolved)
         settings = presets.preset(settings, recorded)
     if ablation is not None:
         settings = presets.ablated(settings, ablation)
@@ -301,12 +301,12 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     if settings.method.is_volume:
         folder.write_config(out, config)
         state = fit.fit(*given, **more)
-        found = _judged(sequence, out, device)
+        judged = _judged(sequence, out, device)
     else:
         folder.write_config(out, config)
-        state, found = _fit_gaussians(sequence, *given, **more)
+        state, judged = _fit_gaussians(sequence, *given, **more)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
-    attempts.conclude(out, config, vars(state), found)
+    attempts.conclude(out, config, vars(state), judged)
 
 
 def _judged(
@@ -375,12 +375,12 @@ def _warn(sequence: Sequence, compared: Sequence) -> None:
     """
     stated = sequence.calibration
     if sequence.complete_quartets and not sequence.from_phasors:
-        found = constant_part(compared)
-        if not found.is_explained:
+        part = constant_part(compared)
+        if not part.is_explained:
             text = (
                 "the quads have a constant part of %.2f amplitudes more than the calibration says"
             )
-            LOG.warning(f"{text}: see `gftorf check`", found.left)
+            LOG.warning(f"{text}: see `gftorf check`", part.left)
     delay = float(stated.settings.get("row_time_s", 0.0) or 0.0)
     if delay > 0:
         text = "a rolling shutter: the last row is %.3g ms later than the first, which is ignored"

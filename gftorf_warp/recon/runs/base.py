@@ -38,7 +38,7 @@ KINDS: dict[str, type[Run]] = {}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run(StoredRun):
-    """What :func:`gftorf_warp.reconstruct` returns, and what is found again in its folder.
+    """What :func:`gftorf_warp.reconstruct` returns, and what its folder stores.
 
     >>> from gftorf_warp import Run, reconstruct, simulate
     >>> recording = simulate("demo", "demo", frames=8, size=(24, 18))
@@ -58,19 +58,19 @@ class Run(StoredRun):
             Gaussians and motion are finite.
         """
         path = Path(path)
-        found = read_back(path)
-        method = found.config["settings"].get("method", Method.GAUSSIANS)
-        kind = KINDS["windows" if found.config.get("windows") else method]
-        return kind._opened(path, found, device)
+        described = read_back(path)
+        method = described.config["settings"].get("method", Method.GAUSSIANS)
+        kind = KINDS["windows" if described.config.get("windows") else method]
+        return kind._opened(path, described, device)
 
     @classmethod
-    def _opened(cls, path: Path, found: ReadBack, device: torch.device | str) -> Run:
+    def _opened(cls, path: Path, described: ReadBack, device: torch.device | str) -> Run:
         """The run of a folder whose config is of this kind."""
-        stored, found = newest(path, found, device)
+        stored, described = newest(path, described, device)
         with checkpoint.rebuilding(path):
             content = field_and_motion(stored, device)
         edits.check_finite(path, *content[:2])
-        return cls._of(path, found, *content)
+        return cls._of(path, described, *content)
 
     def edited(self, field: GaussianField, rows: Int[Tensor, "N"] | None = None) -> Run:
         """This run with other Gaussians under its motion, for example a selection of its own.
@@ -204,11 +204,11 @@ class Run(StoredRun):
         is logged.
         """
         try:
-            found = MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
-            if found is None or self.fallback is None:
-                return found
+            measured = MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
+            if measured is None or self.fallback is None:
+                return measured
             # beside what moves, a fit that explains the quads as well as the mean is right
-            return replace(found, averaged=self.fallback.rests)
+            return replace(measured, averaged=self.fallback.rests)
         except InputError as error:
             LOG.warning("outlines from renderings alone: %s: %s", error.what, error.why)
             return None
@@ -242,7 +242,7 @@ class Run(StoredRun):
 
 
 def newest(
-    run: Path, found: ReadBack, device: torch.device | str
+    run: Path, described: ReadBack, device: torch.device | str
 ) -> tuple[dict[str, Any], ReadBack]:
     """The newest checkpoint in the folder of a run, and its config with how far that is.
 
@@ -262,4 +262,4 @@ def newest(
     if damaged:
         reached["damaged_checkpoints"] = damaged
     # of an interrupted run, config.json does not say
-    return stored, replace(found, config=found.config | reached)
+    return stored, replace(described, config=described.config | reached)

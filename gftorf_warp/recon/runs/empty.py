@@ -25,13 +25,15 @@ class WithoutGaussians(Run, abc.ABC):
     """A run of another method, whose field is empty."""
 
     @classmethod
-    def _opened(cls, path: Path, found: ReadBack, device: torch.device | str) -> Self:
-        return cls._empty(path, found, device)
+    def _opened(cls, path: Path, described: ReadBack, device: torch.device | str) -> Self:
+        return cls._empty(path, described, device)
 
     @classmethod
-    def _empty(cls, path: Path, found: ReadBack, device: torch.device | str, **more: Any) -> Self:
+    def _empty(
+        cls, path: Path, described: ReadBack, device: torch.device | str, **more: Any
+    ) -> Self:
         field, motion = no_gaussians(device), Still(torch.tensor([0.0, 1.0])).to(device)
-        return cls._of(path, found, field, motion, motion.bind(field), **more)
+        return cls._of(path, described, field, motion, motion.bind(field), **more)
 
     def renderer(
         self,

@@ -25,7 +25,7 @@ def rendering_of(
     extra: Float[Tensor, "N D"] | None,
     f_mod_hz: float | None,
 ) -> Rendering:
-    """What the Gaussians of a run look like, see :meth:`gftorf_warp.Run.render`."""
+    """Images of the Gaussians of a run, see :meth:`gftorf_warp.Run.render`."""
     field = run.field.moved(*run.motion.at(run.binding, time))
     rendering = rasterize(
         widened(run, field, camera),
@@ -54,11 +54,11 @@ def replay_of(run: StoredRun, images: Collection[str], f_mod_hz: float | None) -
 
 
 def widened(run: StoredRun, field: GaussianField, camera: Camera) -> GaussianField:
-    """Gaussians as wide as they looked while they were optimised, for a camera that resolves
+    """Gaussians as wide as they were rendered during the optimisation, for a camera that resolves
     more.
 
     The renderer's low-pass filter widens every Gaussian on the image, by ``low_pass`` at any
-    resolution. One that was fitted to smaller images would look thinner here by the difference,
+    resolution. One that was fitted to smaller images would be thinner here by the difference,
     which is added to it as low_pass ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``)
     [m^2].
     """

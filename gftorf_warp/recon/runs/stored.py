@@ -26,7 +26,7 @@ from ..read_back import ReadBack, render_settings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredRun:
-    """What is found in the folder of a run."""
+    """What the folder of a run stores."""
 
     path: Path
     """The folder of the run."""
@@ -49,7 +49,7 @@ class StoredRun:
     def _of(
         cls,
         path: Path,
-        found: ReadBack,
+        described: ReadBack,
         field: GaussianField,
         motion: Motion,
         binding: Float[Tensor, "N M"],
@@ -58,10 +58,10 @@ class StoredRun:
         """The run that a config describes, with further fields of the class."""
         return cls(
             path=path,
-            config=found.config,
-            camera=found.camera,
-            sensor=found.sensor,
-            quad_scale=found.config.get("quad_scale", 1.0),
+            config=described.config,
+            camera=described.camera,
+            sensor=described.sensor,
+            quad_scale=described.config.get("quad_scale", 1.0),
             field=field,
             motion=motion,
             binding=binding,

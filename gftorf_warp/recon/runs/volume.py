@@ -31,12 +31,12 @@ class VolumeRun(WithoutGaussians):
     """What is seen."""
 
     @classmethod
-    def _opened(cls, path: Path, found: ReadBack, device: torch.device | str) -> Self:
-        stored, found = newest(path, found, device)
-        settings = found.config["settings"]
+    def _opened(cls, path: Path, described: ReadBack, device: torch.device | str) -> Self:
+        stored, described = newest(path, described, device)
+        settings = described.config["settings"]
         known, method = settings_of(settings["volume"]), Method(settings["method"])
         volume = volume_from_dict(path, method, known, stored, device)
-        return cls._empty(path, found, device, volume=volume)
+        return cls._empty(path, described, device, volume=volume)
 
     @property
     def has_colour(self) -> bool:
@@ -60,7 +60,7 @@ class VolumeRun(WithoutGaussians):
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
         """
         camera = camera or self.camera
-        found = rendering_of(
+        rendering = rendering_of(
             self.volume,
             time,
             camera,
@@ -68,4 +68,4 @@ class VolumeRun(WithoutGaussians):
             quad_scale=self.quad_scale,
             colour_scale=self.colour_scale,
         )
-        return with_empty_extra(found, extra)
+        return with_empty_extra(rendering, extra)

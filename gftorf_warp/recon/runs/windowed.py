@@ -38,8 +38,8 @@ class WindowedRun(WithoutGaussians):
     """Its windows."""
 
     @classmethod
-    def _opened(cls, path: Path, found: ReadBack, device: torch.device | str) -> Self:
-        config = found.config
+    def _opened(cls, path: Path, described: ReadBack, device: torch.device | str) -> Self:
+        config = described.config
         source.check_windows(path, config)
 
         def opened(number: int) -> Run:
@@ -48,7 +48,7 @@ class WindowedRun(WithoutGaussians):
             return replace(window, config=window.config | {"sequence": config["sequence"]})
 
         windows = [Window.of(stored) for stored in config["windows"]]
-        return cls._empty(path, found, device, joined=Joined(windows, opened))
+        return cls._empty(path, described, device, joined=Joined(windows, opened))
 
     @property
     def gaussians(self) -> int:
