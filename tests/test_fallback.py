@@ -91,6 +91,25 @@ def test_a_wrong_distance_of_what_rests_is_replaced_although_the_quads_are_right
     assert np.abs(distance[:5] - truth[13][:5]).max() < 0.05
 
 
+@pytest.mark.parametrize("steep", [True, False], ids=["slope", "mixture"])
+def test_a_fit_between_its_neighbours_stays_at_a_step_but_not_on_a_slope(box, steep):
+    """The temporal mean of a slope is right; a mixture of two surfaces has no distance."""
+    measured, *_ = box
+    column = np.broadcast_to(np.arange(48.0), (36, 48))
+    distance = 1.0 + 0.12 * column if steep else np.where(column < 24, 2.0, 3.0)
+    phasor = 0.5 / distance**2 * np.exp(1j * 4.0 * np.pi / 15.0 * distance)
+    if not steep:
+        phasor[:, 24] = 0.3 * phasor[:, 23] + 0.7 * phasor[:, 25]
+    quads = np.real(phasor * np.exp(-1j * measured.shifts[:, None, None]))
+    noise = measured.quads - box[1]
+    found = fallback_of(replace(measured, quads=(quads + noise).astype(np.float32)), quads)
+    wrong = np.where(column == 24, distance - 0.1, distance)
+    given, source, _ = applied(found, wrong, 13)
+    assert (source[:, 24] == (TEMPORAL if steep else FIT)).mean() > 0.9
+    if steep:
+        assert np.abs(given - distance)[:, 24].max() < 0.05
+
+
 def test_a_turn_that_the_fit_knows_is_kept(box):
     """One unambiguous range more decodes to the same phase."""
     measured, quads, truth = box

@@ -17,7 +17,7 @@ distance of a pixel wherever one phasor explains its quads, or explains them as 
 does. Raw frames that were made from phasors are explained by one whatever moved, and prove nothing.
 
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
-a fit between the two sides stays if it explains the quads.
+a fit between the two sides stays if it explains the quads. A slope is no step, however steep.
 
 How much is a matter of the odds that the fit is right, from the shares of pixels where residuals.py
 finds it wrong: a ratio of chi-squares, twice the logarithm of the odds as a difference of their
@@ -39,13 +39,14 @@ from ..data import temporal
 from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
 from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
-from ..data.steps import STEP_M, grown
+from ..data.steps import STEP_M, grown, near_steps
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.measured import extremes
 from ..scene.sensor import quad_from_phasor
 from . import closed_form
 from .collapse import NEAR
+from .outlines import at_outlines
 from .residuals import CHI_SQUARE_MAX, Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
@@ -70,6 +71,8 @@ class Fallback:
     """Distance of the quartet [m], in [0, range)."""
     moved: Bool[Tensor, "Q H W"]
     """Where it replaces the fit."""
+    mixed: Bool[Tensor, "Q H W"]
+    """Where the temporal mean may be one of two surfaces."""
     explained: Bool[Tensor, "Q H W"]
     """Where the fit explains the quads."""
 
@@ -125,6 +128,7 @@ class Fallback:
             rests=tensor((count > 1) & ~fit_stays),
             closed_form=tensor(alone),
             moved=tensor(moved),
+            mixed=tensor(near_steps(mean) | np.stack([_at_outlines(image) for image in mean])),
             explained=tensor(explained),
         )
 
@@ -142,7 +146,7 @@ class Fallback:
         apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
         averaged = self.rests[row] & ~(apart.abs() <= self.stays[row])
         between = _between(fit, mean, STEP_M + 2.0 * self.stays[row])
-        averaged &= ~(between & self.explained[row])
+        averaged &= ~(between & self.mixed[row] & self.explained[row])
         value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
         distance = torch.where(averaged, value, fit)
         distance = torch.where(self.moved[row], self.closed_form[row], distance)
@@ -169,11 +173,13 @@ def _is_useless(found: Residuals, sequence: Sequence, noise: QuadNoise) -> bool:
 def _between(
     fit: Float[Tensor, "H W"], mean: Float[Tensor, "H W"], step: Float[Tensor, "H W"]
 ) -> Bool[Tensor, "H W"]:
-    """Where the mean has a step within 3x3 pixels, and the fit is between its two sides: there a
-    pixel is a mixture of two surfaces, which has no distance of its own.
-    """
+    """Where the mean changes by a step within 3x3 pixels, and the fit is between both sides."""
     low, high = extremes(mean)
     return (high - low > step) & (fit >= low) & (fit <= high)
+
+
+def _at_outlines(distance: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    return at_outlines(torch.as_tensor(distance)).numpy()
 
 
 def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:

@@ -67,6 +67,14 @@ def resolved(rendering: Rendering, sensor: Sensor, phasor: Phasor | None = None)
     return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
 
 
+def at_outlines(distance: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Pixels between two surfaces, in any of the four directions."""
+    padded, found = _padded(distance), torch.zeros_like(distance, dtype=torch.bool)
+    for rows, columns in DIRECTIONS:
+        found |= _between_two_surfaces(padded, (-rows, -columns), (rows, columns))
+    return found
+
+
 class _Side(NamedTuple):
     """What P pixels have on one side."""
 
