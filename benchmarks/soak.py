@@ -1,14 +1,18 @@
 """Simulate, check, reconstruct, render, compare and export in a loop in one process: what grows?
 
     python benchmarks/soak.py [--hours H] [--rounds N] [--out FILE.csv]
+    GLIBC_TUNABLES=glibc.malloc.tcache_count=0 python benchmarks/soak.py --hours 0.3
 
 Every round does all of it at tiny size on the CPU, with another seed, and deletes its folder. The
 process has a folder of its own for temporary files (TMPDIR) and another one to work in. After each
-round and a garbage collection, a line of the CSV file states resident and anonymous memory, open
-file descriptors, threads, and files in TMPDIR, in the working folder and in ~/.cache/gftorf_warp.
+round and a garbage collection, a line of the CSV file states resident and anonymous memory, what
+the C library has handed out, open file descriptors, threads, and files in TMPDIR, in the working
+folder and in ~/.cache/gftorf_warp.
 
 At the end the slopes of memory over the second half are printed, by least squares, with their
-standard errors. The exit code is 1 if memory or a number of something grew, see ``grown``.
+standard errors. Pages that an allocator keeps make resident memory noisy by megabytes; what it has
+handed out is exact once its caches per thread are off, as in the second line. The exit code is 1 if
+memory or a number of something grew, see ``grown``.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import ctypes
 import gc
 import logging
 import os
@@ -43,7 +48,7 @@ CACHE = Path.home() / ".cache" / "gftorf_warp"
 MIB = 1 << 20
 ERRORS = 3.0  # a slope is no noise beyond so many standard errors
 MEMORY_MIB = 1.0  # [MiB] over the second half; an allocator's pages come and go by less
-MEMORY = ("resident_mib", "anonymous_mib")
+MEMORY = ("resident_mib", "anonymous_mib", "allocated_mib")
 NUMBERS = ("descriptors", "threads", "temporary", "working", "cached")
 
 
@@ -59,6 +64,8 @@ class State:
     """Resident memory [MiB]."""
     anonymous_mib: float
     """Of it what maps no file [MiB]."""
+    allocated_mib: float
+    """Handed out by the C library [MiB]; 0 where it is not glibc 2.33 or newer."""
     descriptors: int
     """Open file descriptors."""
     threads: int
@@ -83,10 +90,30 @@ class State:
             number,
             (time.monotonic() - begun) / 3600,
             *memory,
+            allocated() / MIB,
             opened[0] - 1,  # without that of the listing
             opened[1],
             *(files_in(folder) for folder in (*folders, CACHE)),
         )
+
+
+class Allocations(ctypes.Structure):
+    """glibc's ``struct mallinfo2``, from malloc.h."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks "
+        "keepcost".split()
+    ]
+
+
+def allocated() -> int:
+    """Bytes that the C library has handed out, in all arenas and by mmap."""
+    if not hasattr(libc := ctypes.CDLL(None), "mallinfo2"):
+        return 0
+    libc.mallinfo2.restype = Allocations
+    found = libc.mallinfo2()
+    return found.uordblks + found.hblkhd
 
 
 def files_in(folder: Path) -> int:

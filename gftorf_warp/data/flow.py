@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from .sequence import Flow, Sequence
+from .threads import KeptThreads
 
 Method = Literal["dis", "deepflow"]
 
@@ -58,7 +58,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis", every: int | Non
         return there, back, _consistent(there, back), _consistent(back, there)
 
     # OpenCV releases Python's lock
-    with ThreadPoolExecutor(thread_name_prefix="gftorf-flow") as threads:
+    with KeptThreads("gftorf-flow") as threads:
         by_pair = dict(zip(pairs, threads.map(matched, pairs), strict=True))
 
         def combined(k: int, first: int, step: int) -> dict[int, np.ndarray]:

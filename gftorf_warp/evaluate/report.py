@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from ..data.decode import unambiguous_range
+from ..data.threads import KeptThreads
 from ..recon.residuals import problems
 from ..render.buffers import available_threads
 from . import figures, gallery, page, panels, provenance, tables
@@ -47,7 +47,8 @@ def report(
     ``simulated`` the command there that made it.
     """
     s = panels.telling_row(comparison)
-    with ThreadPoolExecutor(available_threads()) as pool:  # pictures are encoded without the GIL
+    # pictures are encoded without the GIL
+    with KeptThreads("gftorf-report", available_threads()) as pool:
         distances = pool.submit(_distance_pictures, comparison, s)
         measured = pool.submit(panels.measured_quartet, comparison, s)
         residual = pool.submit(panels.quad_residual, comparison, s)

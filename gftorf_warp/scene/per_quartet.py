@@ -8,7 +8,6 @@ point moves if the raw frames along its flow differ from the static background. 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data.sequence import Sequence
+from ..data.threads import KeptThreads
 from .along_flow import DIFFERS, POOL, REACH, along_best
 from .measured import (
     ROUNDING,
@@ -125,7 +125,7 @@ def _mapped(
     count = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(count, thread_name_prefix="gftorf-points") as threads:
+        with KeptThreads("gftorf-points", count) as threads:
             return list(threads.map(decoded, quartets))
     finally:
         torch.set_num_threads(count)
