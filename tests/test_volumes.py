@@ -90,44 +90,41 @@ def d_tof_error(run, truth_distance):
     return float(torch.mean((decoded - truth_distance).square()))
 
 
+WORSE = {"torf": 5.0, "ftorf": 1.0, "volume": 10.0}
+"""[1] of d over d_ToF at least; ftorf comes to 1.5 to 5 in so few steps."""
+FLOWS = {"torf": 0.0, "ftorf": 1.0, "volume": 0.01}
+"""[m] of the mean flow at most where nothing moves; the network of ftorf is far from its end."""
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_a_scene_at_rest_is_learnt(name, tmp_path):
-    """Its d_ToF ends near the closed form; at the start it is decimetres off."""
-    sequence = small()
-    known = torch.tensor(decoded(sequence.quads[:4]))
-    settings = toy(name, images=160)
-    targets = Targets(observe(sequence, settings, "cpu"))
-    run = reconstruct(sequence, tmp_path / name, settings)
-    assert isinstance(run, VolumeRun)
-    after = d_tof_error(run, known)
-    fresh = new_volume(settings.method, settings.volume, targets, 0, torch.device("cpu"))
-    before = d_tof_error(replace(run, volume=fresh), known)
-    assert after < 0.02
-    assert after < 0.1 * before
-    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
-    assert [row["images"] for row in rows] == list(range(10, 161, 10))
-    assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 8.0
-    flowing = {"quads", "size", "kinetic", "round_trip", "flow"}
-    expected = {"torf": {"quads"}, "ftorf": flowing, "volume": flowing | {"at_rest"}}[name]
-    assert expected <= rows[-1].keys()
-
-
-@pytest.mark.parametrize(("name", "worse"), [("torf", 5.0), ("ftorf", 1.2), ("volume", 5.0)])
-def test_noise_is_averaged_over_time(name, worse, tmp_path):
-    """At rest, d_ToF ends below the closed form of every quartet, and d is several times worse,
-    because quads do not say where along a ray their light is from; ftorf is far from its end.
+def test_a_noisy_scene_at_rest_is_learnt(name, tmp_path):
+    """Its d_ToF ends below the closed form of every quartet, since noise is averaged over time; d
+    is several times worse, because quads do not say where along a ray their light is from. Nothing
+    is explained by flow, which makes a noise of its own of every raw frame.
     """
-    sequence, draw = small(24), np.random.default_rng(0)
+    sequence, draw = small(12), np.random.default_rng(0)
     known = torch.tensor(decoded(sequence.quads[:4]))
     noise = 0.08 * np.abs(sequence.quads).max() * draw.standard_normal(sequence.quads.shape)
     sequence = replace(sequence, quads=(sequence.quads + noise).astype(np.float32))
-    quartets = torch.tensor(decoded(sequence.quads.reshape(6, 4, 12, 16).swapaxes(0, 1)))
+    quartets = torch.tensor(decoded(sequence.quads.reshape(3, 4, 12, 16).swapaxes(0, 1)))
     closed_form = float((quartets - known).square().mean())
-    run = reconstruct(sequence, tmp_path / name, toy(name, images=160))
+    settings = toy(name, images=100, samples=12)
+    run = reconstruct(sequence, tmp_path / name, settings)
+    assert isinstance(run, VolumeRun)
     d_tof = d_tof_error(run, known)
-    d = float((run.render(0.02).distance - known).square().mean())
-    assert d_tof < 0.8 * closed_form
-    assert d > worse * d_tof
+    targets = Targets(observe(sequence, settings, "cpu"))
+    fresh = new_volume(settings.method, settings.volume, targets, 0, torch.device("cpu"))
+    assert d_tof < 0.6 * closed_form
+    assert d_tof < 0.1 * d_tof_error(replace(run, volume=fresh), known)
+    assert float((run.render(0.02).distance - known).square().mean()) > WORSE[name] * d_tof
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["images"] for row in rows] == list(range(10, 101, 10))
+    assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 5.0
+    flowing = {"quads", "size", "kinetic", "round_trip", "flow"}
+    expected = {"torf": {"quads"}, "ftorf": flowing, "volume": flowing | {"at_rest"}}[name]
+    assert expected <= rows[-1].keys()
+    flow = rows[-1].get("size", 0.0) / settings.volume.scene_flow.size
+    assert flow <= FLOWS[name]
 
 
 @pytest.mark.parametrize("name", NAMES)
