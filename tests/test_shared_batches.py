@@ -260,10 +260,10 @@ SIGNATURES = {
     "warp_max": "int warp_max(int x)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
     "lanes_with": "int lanes_with(bool x)",
-    "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
-    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, int lowest, "
-    "wp::array_t<int> ids, "
-    "int place, int begin, int end)",
+    "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int index)",
+    "write_ids": "void write_ids(wp::uint64 set_bits, wp::array_t<int> order, int rank, "
+    "int lowest, wp::array_t<int> ids, "
+    "int start, int begin, int end)",
 }
 
 

@@ -48,31 +48,31 @@ def derivative(view: CameraView, x: float, y: float) -> wp.vec3:
 def distorted(view: CameraView, x: float, y: float) -> wp.vec2:
     """Image slopes of the pinhole point (x, y) [1]; linearised outside the lens' disc."""
     near = inside(view, x, y)
-    place = bent(view, near[0], near[1])
+    image = bent(view, near[0], near[1])
     slope = derivative(view, near[0], near[1])
     dx = x - near[0]
     dy = y - near[1]
     return wp.vec2(
-        place[0] + (slope[0] * dx + slope[1] * dy), place[1] + (slope[1] * dx + slope[2] * dy)
+        image[0] + (slope[0] * dx + slope[1] * dy), image[1] + (slope[1] * dx + slope[2] * dy)
     )
 
 
 @wp.func
 def undistorted(view: CameraView, x: float, y: float) -> wp.vec2:
     """Pinhole slopes of the image slopes (x, y) [1] inside the image, by Newton's iteration."""
-    place = wp.vec2(x, y)
+    point = wp.vec2(x, y)
     missing = float(1.0)
     step = int(0)
     while missing > CLOSE and step < STEPS_MAX:
-        found = bent(view, place[0], place[1])
-        slope = derivative(view, place[0], place[1])
-        dx = x - found[0]
-        dy = y - found[1]
+        image = bent(view, point[0], point[1])
+        slope = derivative(view, point[0], point[1])
+        dx = x - image[0]
+        dy = y - image[1]
         area = slope[0] * slope[2] - slope[1] * slope[1]
-        place = place + wp.vec2(dx * slope[2] - dy * slope[1], dy * slope[0] - dx * slope[1]) / area
+        point = point + wp.vec2(dx * slope[2] - dy * slope[1], dy * slope[0] - dx * slope[1]) / area
         missing = wp.max(wp.abs(dx), wp.abs(dy))
         step += 1
-    return place
+    return point
 
 
 @wp.func

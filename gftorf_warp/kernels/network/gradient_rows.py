@@ -29,12 +29,12 @@ def capacity(keys: int, count: int) -> int:
     const int blocks = (count + {BLOCK - 1}) / {BLOCK}, key = block / blocks, first = block % blocks
         * {BLOCK};
 #if defined(__CUDA_ARCH__)
-    const int found = __syncthreads_count(has(key, first + threadIdx.x));
-    if (threadIdx.x == 0) counts.data[block] = found;
+    const int rows = __syncthreads_count(has(key, first + threadIdx.x));
+    if (threadIdx.x == 0) counts.data[block] = rows;
 #else
-    int found = 0;
-    for (int n = 0; n < {BLOCK}; ++n) found += has(key, first + n);
-    counts.data[block] = found;
+    int rows = 0;
+    for (int n = 0; n < {BLOCK}; ++n) rows += has(key, first + n);
+    counts.data[block] = rows;
 #endif
 """)
 def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.array[wp.int32]):

@@ -48,9 +48,9 @@ HEAD_BLOCKS = 2  # that a multiprocessor holds at once, with 128 registers a thr
         for (int i = 0; i < 8; ++i) {{
             auto half_of = [](const uint4& eight, int n) {{
                 const unsigned two = n < 2 ? eight.x : n < 4 ? eight.y : n < 6 ? eight.z : eight.w;
-                wp::half found;
-                found.u = (unsigned short)(n % 2 ? two >> 16 : two);
-                return wp::half_to_float(found);
+                wp::half value;
+                value.u = (unsigned short)(n % 2 ? two >> 16 : two);
+                return wp::half_to_float(value);
             }};
             #pragma unroll
             for (int n = 0; n < 8; ++n)

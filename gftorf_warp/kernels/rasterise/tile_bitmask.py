@@ -14,8 +14,8 @@ GROUP = wp.constant(8)
 
 
 @wp.func
-def place_of_word(tile: int, word: int, words: int) -> int:
-    """Where the matrix has a word of a tile."""
+def index_of_word(tile: int, word: int, words: int) -> int:
+    """Index of a word of a tile in the matrix."""
     return (tile // GROUP * words + word) * GROUP + tile % GROUP
 
 
@@ -27,10 +27,10 @@ def part_of_tile(warp: int, parts: int) -> wp.vec2i:
 
 
 @wp.func_native(
-    f"return (wp::uint64)bits.data[place] | (wp::uint64)bits.data[place + {GROUP}] << 32;"
+    f"return (wp::uint64)bits.data[index] | (wp::uint64)bits.data[index + {GROUP}] << 32;"
 )
-def two_words(bits: wp.array[wp.uint32], place: int) -> wp.uint64:
-    """The word of a tile at a place of the matrix, and the one behind it."""
+def two_words(bits: wp.array[wp.uint32], index: int) -> wp.uint64:
+    """The word of a tile at an index of the matrix, and the next one of this tile."""
 
 
 STEP = wp.constant(2048)  # bits that a warp of CUDA reads at once, 64 a lane
@@ -40,32 +40,32 @@ WARPS = 8  # of a block
 # plain pointers: Warp's indexing, with strides and negative indices, takes twice the instructions
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ unsigned short room[{WARPS}][{STEP}];
-    unsigned short* const ranks = room[threadIdx.x >> 5];
-    for (int k = place - begin; found; found &= found - 1)
-        ranks[k++] = (unsigned short)(rank - lowest + __ffsll((long long)found) - 1);
+    __shared__ unsigned short of_warps[{WARPS}][{STEP}];
+    unsigned short* const ranks = of_warps[threadIdx.x >> 5];
+    for (int k = start - begin; set_bits; set_bits &= set_bits - 1)
+        ranks[k++] = (unsigned short)(rank - lowest + __ffsll((long long)set_bits) - 1);
     __syncwarp();
     for (int k = begin + (int)(threadIdx.x & 31); k < end; k += 32) ids.data[k] =
         order.data[lowest + ranks[k - begin]];
     __syncwarp();
 #else
-    for (int k = place; found && k < end; found &= found - 1)
-        ids.data[k++] = order.data[rank + __builtin_ctzll(found)];
+    for (int k = start; set_bits && k < end; set_bits &= set_bits - 1)
+        ids.data[k++] = order.data[rank + __builtin_ctzll(set_bits)];
 #endif
 """)
 def write_ids(
-    found: wp.uint64,
+    set_bits: wp.uint64,
     order: wp.array[wp.int32],
     rank: int,
     lowest: int,
     ids: wp.array[wp.int32],
-    place: int,
+    start: int,
     begin: int,
     end: int,
 ):
     """List the splats whose bits are set, the lowest of depth rank ``rank``, in a warp ``lowest``.
 
-    Those of this lane go to ``place`` on, those of the warp to ``begin`` .. ``end`` - 1.
+    Those of this lane are written from ``start`` on, those of the warp to ``begin`` .. ``end`` - 1.
     """
 
 
@@ -85,13 +85,13 @@ def count_bits(
     warp, lane = wp.tid()
     mine = part_of_tile(warp, parts)
     if mine[0] < tiles:
-        found = int(0)
+        count = int(0)
         word = mine[1] * length + 2 * lane
         end = wp.min(words, (mine[1] + 1) * length)
         while word < end:
-            found += wp.bit_count(two_words(bits, place_of_word(mine[0], word, words)))
+            count += wp.bit_count(two_words(bits, index_of_word(mine[0], word, words)))
             word += 2 * lanes
-        sums = sum_of_lanes(found)
+        sums = sum_of_lanes(count)
         if lane == lanes - 1:
             counts[mine[0] * parts + mine[1]] = sums
 
@@ -121,24 +121,24 @@ def list_bits(
     mine = part_of_tile(warp, parts)
     if mine[0] < tiles:
         number = mine[0] * parts + mine[1]
-        at = int(0)  # the place of the first splat of the next words
+        at = int(0)  # list position of the first splat of the next words
         if number > 0:
             at = ends[number - 1]
         if mine[1] == 0 and lane == 0:
             first[mine[0]] = wp.min(at, capacity)
         end = wp.min(ends[number], capacity)
         word = mine[1] * length
-        while at < end:  # as all control here the same for all lanes of a warp
-            own = word + 2 * lane
-            found = wp.uint64(0)
-            if own < words:
-                found = two_words(bits, place_of_word(mine[0], own, words))
-            if warp_any(found != wp.uint64(0)):
-                count = wp.bit_count(found)
+        while at < end:  # like all control flow here, the same in all lanes of a warp
+            lane_word = word + 2 * lane
+            set_bits = wp.uint64(0)
+            if lane_word < words:
+                set_bits = two_words(bits, index_of_word(mine[0], lane_word, words))
+            if warp_any(set_bits != wp.uint64(0)):
+                count = wp.bit_count(set_bits)
                 sums = sum_of_lanes(count)
                 until = at + of_lane(sums, lanes - 1)
-                place = at + sums - count
+                start = at + sums - count
                 stop = wp.min(until, capacity)
-                write_ids(found, order, 32 * own, 32 * word, ids, place, at, stop)
+                write_ids(set_bits, order, 32 * lane_word, 32 * word, ids, start, at, stop)
                 at = until
             word += 2 * lanes

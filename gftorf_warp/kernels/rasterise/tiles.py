@@ -10,7 +10,7 @@ import warp as wp
 
 from .simd import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
-from .tile_bitmask import place_of_word
+from .tile_bitmask import index_of_word
 
 # kernels must agree on every span to the last bit; contraction differs from kernel to kernel
 wp.set_module_options({"fuse_fp": False})
@@ -130,7 +130,7 @@ def mark_pairs(
                 pair = begin + lane
                 tile = tile_of(rows, pair, top, tiles_x)
                 if pair < count:
-                    wp.atomic_or(bits, place_of_word(tile, rank // 32, words), bit)
+                    wp.atomic_or(bits, index_of_word(tile, rank // 32, words), bit)
                 begin += lanes
             top += lanes
 
@@ -175,7 +175,7 @@ def emit_pairs(
     tile_height: int,  # rows of a tile [px]
     lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
     tiles_x: int,  # tiles per row [1]
-    tile_count: int,  # tiles of the image: the key of a place that no pair takes [1]
+    tile_count: int,  # tiles of the image: the key of an unused entry [1]
     ends: wp.array[int],  # [N] sums of counts: where the pairs of each splat end, in depth order
     capacity: int,  # pairs that fit [1]
     # Out:
@@ -193,7 +193,7 @@ def emit_pairs(
         keys[free] = tile_count
         free += ends.shape[0] * lanes
     i = order[rank]
-    at = int(0)  # the place of the first pair of these rows
+    at = int(0)  # index of the first pair of these rows
     if rank > 0:
         at = ends[rank - 1]
     if box_px[i][2] > 0:
@@ -232,10 +232,10 @@ def tile_starts(
     high = int(count)
     while low < high:  # the same for all lanes of a warp
         step = (high - low + lanes + 1) // (lanes + 1)  # so that lanes + 1 steps go beyond the end
-        place = low + (lane + 1) * step - 1
+        entry = low + (lane + 1) * step - 1
         before = bool(False)
-        if place < high:
-            before = keys[place] < tile
+        if entry < high:
+            before = keys[entry] < tile
         steps = lanes_with(before)
         high = wp.min(high, low + (steps + 1) * step - 1)
         low += steps * step

@@ -34,16 +34,14 @@ class Cell:
 def cell_of(point: wp.vec3, cells: int) -> Cell:
     """The cell of a point, which is clamped to the unit cube."""
     along = wp.max(wp.min(point, wp.vec3(1.0)), wp.vec3(0.0)) * float(cells)
-    found = Cell()
-    found.first = wp.vec3i(
+    cell = Cell()
+    cell.first = wp.vec3i(
         wp.min(int(along[0]), cells - 1),
         wp.min(int(along[1]), cells - 1),
         wp.min(int(along[2]), cells - 1),
     )
-    found.share = along - wp.vec3(
-        float(found.first[0]), float(found.first[1]), float(found.first[2])
-    )
-    return found
+    cell.share = along - wp.vec3(float(cell.first[0]), float(cell.first[1]), float(cell.first[2]))
+    return cell
 
 
 @wp.func
