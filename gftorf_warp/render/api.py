@@ -126,7 +126,7 @@ def rasterize(
     A field with a parameter that is NaN or infinite is refused. In one of many renderings, with
     ``workspace``, ``control`` or a pair capacity, where nothing may wait for the device, it is
     drawn instead: NaN where a Gaussian has a reflectivity or colour that is NaN, and everywhere if
-    its place, size, orientation or opacity is not finite.
+    its position, size, orientation or opacity is not finite.
 
     Runs on the device of the field. Differentiable in every tensor of the field except its layer,
     in ``background``, ``extra`` and the 0-d tensors of the sensor.
@@ -213,13 +213,13 @@ def rasterize(
         control=control,
         extra_detached=extra_detached,
     )
-    found = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))
+    rendered = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))
     for name in CHOICES:
-        if found[name] is None:
-            found[name] = left_out(name, field.mean, *size)
-    if extra is not None and found["extra"] is None:
-        found["extra"] = extra.new_zeros(0, *size)
-    return Rendering(**found, screen=None if screen is None else ScreenGradient(values=screen))
+        if rendered[name] is None:
+            rendered[name] = left_out(name, field.mean, *size)
+    if extra is not None and rendered["extra"] is None:
+        rendered["extra"] = extra.new_zeros(0, *size)
+    return Rendering(**rendered, screen=None if screen is None else ScreenGradient(values=screen))
 
 
 def _spread(

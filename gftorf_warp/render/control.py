@@ -62,9 +62,9 @@ def check(control: DeviceCamera, shifts: int, device: torch.device) -> None:
     ):
         tensor = getattr(control, name)
         if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
-            found = f"{tuple(tensor.shape)} of {tensor.dtype} on {tensor.device}"
+            actual = f"{tuple(tensor.shape)} of {tensor.dtype} on {tensor.device}"
             raise ValueError(
-                f"control.{name} is {found}, must be {shape} of torch.float32 on {device}"
+                f"control.{name} is {actual}, must be {shape} of torch.float32 on {device}"
             )
         if not tensor.is_contiguous():
             raise ValueError(f"control.{name} must be contiguous")

@@ -76,26 +76,28 @@ class CublasLayers(Layers):
         self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor
     ) -> list[Tensor]:
         """As the base class says."""
-        keys, found = len(time), _ParameterGradients(form, time, len(outputs), gradients)
+        keys, of_parameters = len(time), _ParameterGradients(form, time, len(outputs), gradients)
         side = side_stream(position.device)
         with side.fork():  # small products, while the last blocks of the large one finish
-            found.head_bias.copy_(gradients.head_sum)
-            product(gradients.head.T, outputs[-1], time.dtype, out=found.weights[-1])
-            torch.sum(gradients.sums, 1, out=found.biases)
+            of_parameters.head_bias.copy_(gradients.head_sum)
+            product(gradients.head.T, outputs[-1], time.dtype, out=of_parameters.weights[-1])
+            torch.sum(gradients.sums, 1, out=of_parameters.biases)
             positions = position.new_empty(keys, len(position), form.columns)
             _copy(positions, position.expand(keys, -1, -1))
-            for number, weight in zip(form.entries, found.of_positions(form), strict=True):
+            for number, weight in zip(form.entries, of_parameters.of_positions(form), strict=True):
                 rows = gradients.layers[number].T
                 product(rows, positions.flatten(0, 1), weight.dtype, out=weight)
             for number in form.entries:
-                weight = found.weights[number]
+                weight = of_parameters.weights[number]
                 weight = weight[:, weight.shape[1] - form.time :]
                 torch.mm(gradients.sums[number].T, time, out=weight)
-        _products(gradients.layers[1:].mT, outputs[:-1], out=found.square)
+        _products(gradients.layers[1:].mT, outputs[:-1], out=of_parameters.square)
         side.join()
         if form.joined is not None:
-            found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
-        return found.times(gradients.unit)
+            of_parameters.weights[form.joined][:, : form.width] = of_parameters.square[
+                form.joined - 1
+            ]
+        return of_parameters.times(gradients.unit)
 
 
 class _ParameterGradients:

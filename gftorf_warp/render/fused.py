@@ -57,10 +57,10 @@ class Scratch:
         """[count, C, H, W + 10] zeroed when they are made."""
         channels, height, width = image.shape
         shape = count, channels, height, width + 2 * image_similarity.REACH
-        found = self._planes.get(name)
-        if found is None or found.shape != shape or found.device != image.device:
-            self._planes[name] = found = image.new_zeros(shape)
-        return found
+        planes = self._planes.get(name)
+        if planes is None or planes.shape != shape or planes.device != image.device:
+            self._planes[name] = planes = image.new_zeros(shape)
+        return planes
 
 
 def image_loss(

@@ -81,11 +81,11 @@ class _Interpolated(torch.autograd.Function):
         table: Tensor,
         levels: Levels,
     ) -> Tensor:
-        found = table.new_empty(*points.shape[:2], 2 * len(levels.cells))
+        values = table.new_empty(*points.shape[:2], 2 * len(levels.cells))
         ctx.save_for_backward(points, times, table)
         ctx.levels = levels
-        _launch(kernels.interpolate, points, times, table, levels, [], [_pairs(found)])
-        return found
+        _launch(kernels.interpolate, points, times, table, levels, [], [_pairs(values)])
+        return values
 
     @staticmethod
     @once_differentiable

@@ -20,7 +20,7 @@ def interpolated(
     levels: Levels,
 ) -> Float[Tensor, "T P f"]:
     """Oracle of :func:`gftorf_warp.render.hash_grid.interpolated`."""
-    found = []
+    by_level = []
     for cells, start, rows in zip(*(each.tolist() for each in levels[:3]), strict=True):
         along = points.clamp(0.0, 1.0) * cells
         first = along.detach().floor().clamp_max(cells - 1)
@@ -32,8 +32,8 @@ def interpolated(
             vertex = torch.cat([first.long() + far, _beside(times, points)], dim=-1)
             row = start + _rows(vertex, cells, rows, levels.times)
             total = total + weight[..., None] * table[row]
-        found.append(total)
-    return torch.cat(found, dim=-1)
+        by_level.append(total)
+    return torch.cat(by_level, dim=-1)
 
 
 def _beside(times: Int[Tensor, "T"], points: Float[Tensor, "T P 3"]) -> Int[Tensor, "T P 1"]:

@@ -53,7 +53,7 @@ class Images:
 
 
 DIFFERENTIABLE = ("quads", "phasor", "distance", "opacity", "distortion")
-"""Those of ``CHOICES`` that have a derivative: what is rendered if nobody says what is wanted."""
+"""Those of ``CHOICES`` that have a derivative: what is rendered by default."""
 CHOICES = (*DIFFERENTIABLE, "distance_median")
 """Images that a rendering may do without; colour and extra depend on what there is to render."""
 

@@ -83,5 +83,5 @@ class Offsets(torch.autograd.Function):
         position, time, *saved, outputs = context.saved_tensors
         rows = gradient.reshape(-1, gradient.shape[-1])
         gradients = layers.backward(form, len(time), rows, outputs, tuple(saved))
-        found = layers.parameter_gradients(form, position, time, gradients, outputs)
-        return *(None,) * 4, *found
+        of_parameters = layers.parameter_gradients(form, position, time, gradients, outputs)
+        return *(None,) * 4, *of_parameters

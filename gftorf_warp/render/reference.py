@@ -163,7 +163,7 @@ def rasterize(
     colours = 0 if field.colour_sh is None else 3
     sizes = [1, 1, colours, more.shape[1], q, 3, 1, 1, 1]
     distance, opacity, colour, more, quads, phasor, half_sum, median, T_end = image.split(sizes)
-    found = {
+    by_name = {
         "quads": quads + _behind(background.quads, T_end, q),
         "phasor": phasor + _behind(background.phasor, T_end, 3),
         "distance": distance[0],
@@ -173,7 +173,7 @@ def rasterize(
     }
     wanted = wanted_images(images)
     return Rendering(
-        **{name: image if name in wanted else image[:0] for name, image in found.items()},
+        **{name: image if name in wanted else image[:0] for name, image in by_name.items()},
         colour=None if field.colour_sh is None else colour + _behind(background.colour, T_end, 3),
         extra=None if extra is None else more,
         screen=screen,

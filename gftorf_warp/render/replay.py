@@ -203,7 +203,7 @@ class Replay:
             places[name] = length, shapes[name]
             length += -(-math.prod(shapes[name]) // ALIGNED) * ALIGNED
         packed = self._like.new_zeros(length + ALIGNED)
-        tensors = {name: part(packed, *place) for name, place in places.items()}
+        tensors = {name: part(packed, *span) for name, span in places.items()}
         settings = replace(self.settings, pair_capacity=self._capacity.pairs)
         with stream_of(self._like):
             buffers = Buffers(len(self._like), width, height, settings, self.device)

@@ -52,14 +52,14 @@ def surface(
     images = wp.array(np.ascontiguousarray(distance, np.float32), dtype=float, device=device)
     field = wp.empty(nodes, dtype=float, device=device)
     hidden = wp.empty(nodes, dtype=wp.uint8, device=device)
-    place = wp.vec3(*map(float, low))
-    inputs = [views, bool(cameras[0].distortion), images, place, voxel, TRUNCATION * voxel]
+    origin = wp.vec3(*map(float, low))
+    inputs = [views, bool(cameras[0].distortion), images, origin, voxel, TRUNCATION * voxel]
     with runtime.LAUNCHING:
         outputs = [field, hidden]
         wp.launch(fuse, nodes, inputs, outputs, device=device, record_tape=False)
-        high = place + voxel * wp.vec3(*(float(n - 1) for n in nodes))
-        found = IsoSurfaceMarchingCubes.extract(field, 0.0, lower=place, upper=high)
-    vertices, corners = (array.numpy() for array in found)
+        high = origin + voxel * wp.vec3(*(float(n - 1) for n in nodes))
+        mesh = IsoSurfaceMarchingCubes.extract(field, 0.0, lower=origin, upper=high)
+    vertices, corners = (array.numpy() for array in mesh)
     known = beside_no(hidden.numpy().astype(bool), (vertices - np.asarray(low)) / voxel)
     return chosen(vertices, corners.reshape(-1, 3), known)
 

@@ -99,7 +99,7 @@ class FusedLayers(Layers):
             counts = weight_gradients.parts(device.sm_count, layers, entries)
         half, halves, width = weight_gradients.HALF, weight_gradients.HALVES, wgmma.WIDTH
         shapes = parameter_shapes(form, layers)
-        found = time.new_empty(sum(map(math.prod, shapes)))
+        of_parameters = time.new_empty(sum(map(math.prod, shapes)))
         by_outputs = time.new_empty(counts[0], halves * (layers - 1), half * width)
         by_positions = time.new_empty(counts[1], halves * entries, half * wgmma.COLUMNS)
         heads = parameter_gradients.HEAD_BLOCKS * counts[2]
@@ -122,8 +122,8 @@ class FusedLayers(Layers):
         inputs = [of, gradients.unit.view(1), gradients.sums, gradients.head_sum, time]
         size = layers * width + wgmma.VALUES, width + form.position + form.time + 1
         parts = [by_outputs, by_positions, by_head]
-        launch(parameter_gradients.collect, size, [*inputs, *parts], [found])
-        values = found.split([*map(math.prod, shapes)])
+        launch(parameter_gradients.collect, size, [*inputs, *parts], [of_parameters])
+        values = of_parameters.split([*map(math.prod, shapes)])
         return [value.view(shape) for value, shape in zip(values, shapes, strict=True)]
 
 
@@ -175,7 +175,7 @@ def parameter_shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
     inputs = [form.width * (number > 0) for number in range(layers)]
     for number in form.entries:
         inputs[number] += form.position + form.time
-    sizes = [*((form.width, own) for own in inputs), (wgmma.VALUES, form.width)]
+    sizes = [*((form.width, count) for count in inputs), (wgmma.VALUES, form.width)]
     return [shape for size in sizes for shape in (size, size[:1])]
 
 
@@ -183,15 +183,15 @@ def parameter_shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
 def _ready(device: torch.device) -> wp.Device:
     """The device, with kernels compiled for exactly its architecture (sm_90a)."""
     runtime.start()
-    found = wp.get_device("cpu") if device.type == "cpu" else wp.device_from_torch(device)
-    if found.is_cuda:
+    warp_device = wp.get_device("cpu") if device.type == "cpu" else wp.device_from_torch(device)
+    if warp_device.is_cuda:
         before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a"
         try:
             for kernel in (kernels.forward, kernels.backward):
-                kernel.module.load(found, wgmma.BLOCK)
+                kernel.module.load(warp_device, wgmma.BLOCK)
         finally:
             wp.config.cuda_arch_suffix = before
-    return found
+    return warp_device
 
 
 @functools.cache

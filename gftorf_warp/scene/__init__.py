@@ -1,1 +1,1 @@
-"""What is optimised, and who looks: Gaussians, motion, camera, sensor."""
+"""What is optimised, and what observes it: Gaussians, motion, camera, sensor."""

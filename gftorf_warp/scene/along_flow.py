@@ -43,7 +43,7 @@ class AlongFlow:
     residual: Float[Tensor, "h w"]
     """Mean squared residual over what is allowed [1]."""
     moves: Bool[Tensor, "h w"]
-    """Whether all raw frames but one differ from the background: a surface may look like it in one
+    """Whether all raw frames but one differ from the background: a surface may resemble it in one
     slot."""
 
 

@@ -1,4 +1,4 @@
-"""Where to look from: poses that look at a point, turn about one, or lead through others.
+"""Viewpoints: poses that face a point, turn about one, or lead through others.
 
 All poses are ``camera_from_world`` [m], for ``Camera.at`` and for ``poses`` of
 ``evaluate.views.render_to_video``.
@@ -23,7 +23,7 @@ def look_at(eye: Point, target: Point, down: Point = DOWN) -> Float[np.ndarray, 
 
     Args:
         eye: Position of the camera in the world [m].
-        target: What it looks at [m].
+        target: Point on the axis of the camera [m].
         down: Direction in the world that is down in the image, as far as the view lets it be.
 
     Raises:
@@ -33,8 +33,8 @@ def look_at(eye: Point, target: Point, down: Point = DOWN) -> Float[np.ndarray, 
     ahead, across = to - at, np.cross(below, to - at)
     length = float(np.linalg.norm(ahead))
     if not np.linalg.norm(across) > PARALLEL * length * np.linalg.norm(below):
-        found = f"from {at.tolist()} to {to.tolist()}"
-        raise ValueError(f"look_at needs a view that is not along down {below.tolist()}: {found}")
+        given = f"from {at.tolist()} to {to.tolist()}"
+        raise ValueError(f"look_at needs a view that is not along down {below.tolist()}: {given}")
     z, x = ahead / length, across / np.linalg.norm(across)
     pose = np.eye(4)
     pose[:3, :3] = x, np.cross(z, x), z

@@ -72,9 +72,9 @@ def moving_layer(
     label = _connected(mask, distance, views.margin[view][row, column])
     names, index, count = label[mask].unique(return_inverse=True, return_counts=True)
     kept = (count >= fellows)[index]
-    place, far = grid[mask][kept], distance[mask][kept]
+    pixel, far = grid[mask][kept], distance[mask][kept]
     amplitude = views.amplitude[view][row, column][mask][kept]
-    mean = unproject(views.cameras[view], place, far)
+    mean = unproject(views.cameras[view], pixel, far)
     layer = Layer(mean=mean, distance=far, amplitude=amplitude)
     return layer, torch.unique(names[index[kept]], return_inverse=True)[1]
 

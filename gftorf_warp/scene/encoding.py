@@ -39,9 +39,9 @@ def encoded(
     size = encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
     if value.requires_grad and torch.is_grad_enabled():
-        found = torch.stack([torch.sin(angles), torch.cos(angles)], dim=-2).flatten(-3)
+        waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=-2).flatten(-3)
         padding = value.new_zeros(*value.shape[:-1], (columns or size) - size)
-        return torch.cat([value, found, padding], dim=-1).to(dtype or value.dtype)
+        return torch.cat([value, waves, padding], dim=-1).to(dtype or value.dtype)
     allocate = torch.empty if columns in (None, size) else torch.zeros
     rows = allocate(
         *value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device

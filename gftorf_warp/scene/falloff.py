@@ -27,8 +27,8 @@ def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
         raise _wrong(path, "there is no such file")
     image = _image(path)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
-        found = f"{image.dtype} {image.shape}"
-        raise _wrong(path, f"expected numbers in rows and columns, found {found}")
+        actual = f"{image.dtype} {image.shape}"
+        raise _wrong(path, f"expected numbers in rows and columns, found {actual}")
     image = image.astype(np.float64)
     if not np.isfinite(image).all() or image.min() <= 0:
         raise _wrong(path, f"expected finite numbers above 0, found {image.min()} to {image.max()}")

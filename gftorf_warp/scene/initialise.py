@@ -252,8 +252,8 @@ def in_frusta(
         points = torch.empty(missing, 3)
         for number in which.unique().tolist():
             rows, camera = which == number, cameras[number]
-            place = u[rows, :2] * torch.tensor([camera.width, camera.height])
-            slopes = camera.slopes(place)
+            pixel = u[rows, :2] * torch.tensor([camera.width, camera.height])
+            slopes = camera.slopes(pixel)
             pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
             local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
             points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]

@@ -142,9 +142,9 @@ def decode_along_flow(
     frames, stack, phasors = sequence.quartet_frames(quartet), torch.stack(quads), []
     shifts, frequencies = sequence.shifts[frames], sequence.frame_frequencies[frames]
     for f in sequence.frequencies:
-        own = frequencies == f
-        angles = tuple(float(s) for s in shifts[own])
-        phasors.append(phasor_from_quads(stack[torch.as_tensor(own)], angles))
+        of_f = frequencies == f
+        angles = tuple(float(s) for s in shifts[of_f])
+        phasors.append(phasor_from_quads(stack[torch.as_tensor(of_f)], angles))
     return distance_from_phasors(phasors, sensor_of(sequence)), 0.5 * torch.hypot(*phasors[0])
 
 

@@ -279,8 +279,8 @@ class Nodes(Motion):
                 f"({len(key_times)}, {len(position)}, 3) and ({len(position)},): keys, nodes, xyz"
             )
         if len(layer) and int(layer.min()) < 1:
-            found = f"a node of layer {int(layer.min())}"
-            raise ValueError(f"{found}: nodes belong to layers 1 and above, 0 is static")
+            given = f"a node of layer {int(layer.min())}"
+            raise ValueError(f"{given}: nodes belong to layers 1 and above, 0 is static")
         if neighbours < 1:
             raise ValueError(f"neighbours must be at least 1, got {neighbours}")
         self.neighbours = neighbours

@@ -73,8 +73,8 @@ class Network(Motion):
         """
         super().__init__(key_times)
         if not (duration > 0 and length > 0):
-            found = f"{duration} s and {length} m"
-            raise ValueError(f"duration and length must be above 0, got {found}")
+            given = f"{duration} s and {length} m"
+            raise ValueError(f"duration and length must be above 0, got {given}")
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
         self.register_buffer("time_encodings", times, persistent=False)

@@ -81,10 +81,10 @@ def moving_points(
     for quartet, now in by_quartet.items():
         column, row = points.astype(int).T
         moving = now.moving[row, column]
-        place, column, row = points[moving], column[moving], row[moving]
+        position, column, row = points[moving], column[moving], row[moving]
         flow, distance = now.flow[:, row, column].T, now.distance[row, column]
-        along = _radial(by_quartet, quartet, place, flow, distance)
-        values = (place, flow, distance, along, now.amplitude[row, column])
+        along = _radial(by_quartet, quartet, position, flow, distance)
+        values = (position, flow, distance, along, now.amplitude[row, column])
         at, step, near, nearer, amplitude = (torch.as_tensor(v).float() for v in values)
         # raw frames are taken at the beginning of each period, so their mean time is before the
         # middle of the quartet, which ends where the next one begins
@@ -187,19 +187,19 @@ def _decoded(
 def _radial(
     decoded: Mapping[int, _Decoded],
     quartet: int,
-    place: Float[np.ndarray, "P 2"],
+    position: Float[np.ndarray, "P 2"],
     flow: Float[np.ndarray, "P 2"],
     distance: Float[np.ndarray, "P"],
 ) -> Float[np.ndarray, "P"]:
     """Change of the distance during a quartet [m]: mean slope to those neighbouring quartets that
     see the point, else zero.
     """
-    total, count = np.zeros(len(place)), np.zeros(len(place))
+    total, count = np.zeros(len(position)), np.zeros(len(position))
     for step in (-1, 1):
         if (other := decoded.get(quartet + step)) is None:
             continue
         height, width = other.distance.shape
-        column, row = np.floor(place + step * flow).astype(int).T
+        column, row = np.floor(position + step * flow).astype(int).T
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         column, row = column.clip(0, width - 1), row.clip(0, height - 1)
         slope = step * (other.distance[row, column] - distance)

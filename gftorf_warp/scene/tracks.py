@@ -50,8 +50,8 @@ def follow(
                 far = far + _shared((decoded - far)[:, None], group)[:, 0]
                 distances[i] = far
     known = ({float(times[i]): value for i, value in each.items()} for each in (places, distances))
-    place, far = (interpolated(each, times, outer=2) for each in known)
-    return unproject(camera, place, far)
+    position, far = (interpolated(each, times, outer=2) for each in known)
+    return unproject(camera, position, far)
 
 
 def unproject(

@@ -89,12 +89,14 @@ class Windows(Motion):
         velocity = torch.zeros_like(mean) if velocity is None else velocity
         nodes, medians = [], []
         for number in label.unique().tolist():
-            own = (label == number).nonzero()[:, 0]
-            chosen = own[farthest_points(mean[own], settings.nodes)]
-            fellows = min(NODE_FELLOWS, len(own))
-            near = torch.cdist(mean[chosen], mean[own]).topk(fellows, dim=1, largest=False).indices
+            members = (label == number).nonzero()[:, 0]
+            chosen = members[farthest_points(mean[members], settings.nodes)]
+            fellows = min(NODE_FELLOWS, len(members))
+            near = (
+                torch.cdist(mean[chosen], mean[members]).topk(fellows, dim=1, largest=False).indices
+            )
             nodes.append(chosen)
-            medians.append(velocity[own][near].median(dim=1).values)
+            medians.append(velocity[members][near].median(dim=1).values)
         chosen = torch.cat(nodes) if nodes else torch.zeros(0, dtype=torch.long)
         start = torch.cat(medians) if medians else torch.zeros(0, 3)
         parts = mean[chosen], label[chosen], start
@@ -109,10 +111,10 @@ class Windows(Motion):
         index = field.mean.new_zeros(len(field), count)
         weight = torch.zeros_like(index)
         for number in self.label.unique().tolist():  # all pairs of all windows would take too much
-            rows, own = ((each == number).nonzero()[:, 0] for each in (label, self.label))
-            apart = torch.cdist(field.mean.detach()[rows], self.node[own])
+            rows, members = ((each == number).nonzero()[:, 0] for each in (label, self.label))
+            apart = torch.cdist(field.mean.detach()[rows], self.node[members])
             nearest, share = node_weights(apart, count)
-            index[rows, : share.shape[1]] = own[nearest].to(index)
+            index[rows, : share.shape[1]] = members[nearest].to(index)
             weight[rows, : share.shape[1]] = share
         return torch.cat([label[:, None].to(weight), index, weight], dim=1)
 
@@ -124,13 +126,13 @@ class Windows(Motion):
         label = binding[:, :1]
         table = torch.arange(self.key_count, device=binding.device)
         key = rows_of(table, keys)[:, None, None]
-        own = label == torch.div(key, 2, rounding_mode="floor") + 1
-        offset = torch.where(own | (label == 0), 0.0, AWAY).expand(-1, -1, 3)
+        inside = label == torch.div(key, 2, rounding_mode="floor") + 1
+        offset = torch.where(inside | (label == 0), 0.0, AWAY).expand(-1, -1, 3)
         if count:
             index, weight = binding[:, 1 : 1 + count].long(), binding[:, 1 + count :]
             chosen = self.velocity.index_select(0, index.flatten()).view(*index.shape, 3)
             whole = (chosen * weight[..., None]).sum(dim=1)
-            offset = offset + torch.where(own, (key % 2) - 0.5, 0.0) * whole
+            offset = offset + torch.where(inside, (key % 2) - 0.5, 0.0) * whole
         return KeyMotion(offset, None)
 
     @property
