@@ -355,9 +355,9 @@ def _reproduce(options: argparse.Namespace) -> int:
     stated = reproduce.stated_result(options.name)
     options.device = stated.device if options.device == "auto" else options.device
     given = {**_named(options, "out", "seeds"), "progress": _progress(options)("reproduce")}
-    found = reproduce.reproduce(stated, device=start(options), **given)
-    print((reproduce.as_json if options.json else reproduce.table)(stated, found))
-    return 0 if all(one.within for one in found) else 1
+    reproduced = reproduce.reproduce(stated, device=start(options), **given)
+    print((reproduce.as_json if options.json else reproduce.table)(stated, reproduced))
+    return 0 if all(one.within for one in reproduced) else 1
 
 
 def _gpus() -> list[str]:

@@ -68,10 +68,10 @@ def demo(
         size_of = f"{sequence.width}x{sequence.height}, {sequence.frames} raw frames"
         step.result = f"{SCENE} {size_of} -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
-        found = check(out / "seq")
-        for line in found.lines:
+        checked = check(out / "seq")
+        for line in checked.lines:
             LOG.debug("      %s", line)
-        for line in found.warnings:
+        for line in checked.warnings:
             LOG.warning(line)
         frequency = f"{sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
         step.result = f"{len(sequence.complete_quartets)} complete quartets at {frequency}"
@@ -100,16 +100,16 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
     wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         path = out / SETTINGS
-        found = read_json(path) if path.is_file() else None
+        stored = read_json(path) if path.is_file() else None
         fix = "choose another --out, or --fresh, which moves its content to old-1"
-        if found is None:
+        if stored is None:
             why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         if fresh:
             moved = set_aside(out, [out / n for n in OURS if (out / n).exists()])
             LOG.info("the earlier demo is now in %s", moved)
-        elif found != wanted:
-            known = found if isinstance(found, dict) else {}
+        elif stored != wanted:
+            known = stored if isinstance(stored, dict) else {}
             differ = ", ".join(key for key in wanted if known.get(key) != wanted[key])
             why = f"it was made with another {differ}"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)

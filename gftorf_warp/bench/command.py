@@ -148,25 +148,25 @@ def bench(
     """
     chosen = checked(parts)
     _check_folders(wanted)
-    found = about(wanted.device)
-    found |= {"quick": wanted.quick, "command": _words(chosen, wanted), "parts": {}}
+    results = about(wanted.device)
+    results |= {"quick": wanted.quick, "command": _words(chosen, wanted), "parts": {}}
     if json is not None:
         _check_file(Path(json))
     if wanted.device != "cpu":  # events and graphs are those of the current device
         torch.get_device_module(torch.device(wanted.device)).set_device(wanted.device)
-    say(" - ".join(str(found[name]) for name in ("device", "driver", "warp", "torch", "commit")))
+    say(" - ".join(str(results[name]) for name in ("device", "driver", "warp", "torch", "commit")))
     with tempfile.TemporaryDirectory(prefix="gftorf-bench-") as folder:
         shared = Shared(wanted, Path(folder))
         for name in chosen:
             measure, table = PARTS[name]
             begun = time.perf_counter()
             rows = measure(shared, quietly if progress is None else progress(name))
-            found["parts"][name] = {"seconds": time.perf_counter() - begun, "rows": rows}
+            results["parts"][name] = {"seconds": time.perf_counter() - begun, "rows": rows}
             if json is not None:
-                write_json(json, found)
+                write_json(json, results)
             for line in ["", *table(rows)]:
                 say(line)
-    return found
+    return results
 
 
 def checked(parts: list[str]) -> list[str]:

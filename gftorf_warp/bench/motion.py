@@ -53,9 +53,9 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         def both(offsets=offsets, weights=weights, cotangent=cotangent) -> object:
             return torch.autograd.grad(offsets(), weights, cotangent)
 
-        found = both_ways(both, watch, runs)
-        best = (found["graph"] or found["eager"])["median"]
-        row = {"N": count, "queries": queries, "products": products, "forward_backward": found}
+        measured = both_ways(both, watch, runs)
+        best = (measured["graph"] or measured["eager"])["median"]
+        row = {"N": count, "queries": queries, "products": products, "forward_backward": measured}
         forward = both_ways(torch.no_grad()(offsets), watch, runs)
         rows.append(row | {"forward": forward, "ms_per_query": best / queries})
         report(done, len(cases), N=count, ms=best)
@@ -79,8 +79,8 @@ def kinds(device: str) -> list[str]:
     """Rows of one case: every precision, and half by cuBLAS where the device has our kernels."""
     times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
     form = Form.of(Network(times, MotionSettings(), duration=1.0, length=LENGTH_M))
-    own = fits(form, torch.empty(0, device=device).device)
-    return [*map(str, Products), *[BY_TORCH] * own]
+    fused = fits(form, torch.empty(0, device=device).device)
+    return [*map(str, Products), *[BY_TORCH] * fused]
 
 
 def points(mean: Float[Tensor, "N 3"]) -> GaussianField:

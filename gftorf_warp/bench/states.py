@@ -61,8 +61,8 @@ def simulated(path: Path, *, quick: bool) -> Path:
 
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
     """A preset with changes, without densification and opacity resets."""
-    found = input_of(sequence, Input.AUTO)
-    recorded = presets.Recorded.of(sequence, found)
+    resolved = input_of(sequence, Input.AUTO)
+    recorded = presets.Recorded.of(sequence, resolved)
     settings = changed(presets.preset(preset, recorded), changes, CHANGES)
     settings = replace(settings, densify=replace(settings.densify, stop_share=0.0))
     threads = 1 if torch.device(device).type == "cpu" else settings.render.threads

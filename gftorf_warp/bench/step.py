@@ -200,11 +200,13 @@ def timeline(run: Run, device: str) -> list[str]:
 
 def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
     """Lines of :func:`timeline` from torch's trace events; those of the host are left out."""
-    found = sorted((e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"])
+    operations = sorted(
+        (e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"]
+    )
     return [
-        f"{event['ts'] - found[0]['ts']:10.1f} {event['dur']:8.1f}  "
+        f"{event['ts'] - operations[0]['ts']:10.1f} {event['dur']:8.1f}  "
         f"{event['args'].get('stream', '-')!s:>4}  {event['name']}"
-        for event in found
+        for event in operations
     ]
 
 

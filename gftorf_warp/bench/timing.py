@@ -152,16 +152,16 @@ def both_ways(function: Function, watch: Watch, runs: int, *, within: int = 1) -
     A graph holds the function ``within`` times, and times are per call: launching a graph takes
     some microseconds itself. A failed capture is reported under ``graph_error`` and in the log.
     """
-    found: dict[str, Any] = {"eager": timed(function, watch, runs).plain(), "graph": None}
+    times: dict[str, Any] = {"eager": timed(function, watch, runs).plain(), "graph": None}
     try:
         replay = watch.captured(lambda: [function() for _ in range(within)])
     except RuntimeError as error:
-        found["graph_error"] = str(error).splitlines()[0]
-        LOG.warning("cannot be captured in a graph: %s", found["graph_error"])
-        return found
+        times["graph_error"] = str(error).splitlines()[0]
+        LOG.warning("cannot be captured in a graph: %s", times["graph_error"])
+        return times
     if replay is not None:
-        found["graph"] = timed(replay, watch, runs, within=within).plain()
-    return found
+        times["graph"] = timed(replay, watch, runs, within=within).plain()
+    return times
 
 
 def cell(timing: dict[str, Any] | None) -> str:

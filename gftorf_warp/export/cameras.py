@@ -81,9 +81,9 @@ def write_pictures(moments: Moments, folder: Path, progress: Progress, colour: s
     images = folder / "images"
     images.mkdir()
     first = None
-    for index, found in enumerate(pixels(moments, colour)):
-        first = first or found
-        write_through(moments.path(images, index, "png"), png_bytes(found.rgb))
+    for index, rendered in enumerate(pixels(moments, colour)):
+        first = first or rendered
+        write_through(moments.path(images, index, "png"), png_bytes(rendered.rgb))
         progress(index + 1, len(moments))
     assert first is not None, "there is no export of no time"
     return first
@@ -101,12 +101,12 @@ def colmap_camera(camera: Camera) -> str:
     return f"{CAMERA_ID} {model} {camera.width} {camera.height} {_text(numbers)}"
 
 
-def colmap_points(found: Pixels, camera: Camera) -> list[str]:
+def colmap_points(rendered: Pixels, camera: Camera) -> list[str]:
     """Lines of points3D.txt, of evenly chosen pixels; no image is said to see a point."""
-    places = world_points(found.distance, camera, found.seen).T
-    every = -(-len(places) // POINTS_MAX) or 1
-    rows = zip(places[::every], found.rgb[found.seen][::every], strict=True)
-    lines = [f"{n} {_text(place)} {r} {g} {b} 0" for n, (place, (r, g, b)) in enumerate(rows, 1)]
+    points = world_points(rendered.distance, camera, rendered.seen).T
+    every = -(-len(points) // POINTS_MAX) or 1
+    rows = zip(points[::every], rendered.rgb[rendered.seen][::every], strict=True)
+    lines = [f"{n} {_text(point)} {r} {g} {b} 0" for n, (point, (r, g, b)) in enumerate(rows, 1)]
     return ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *lines]
 
 

@@ -80,7 +80,7 @@ def record(target: Path, asked: Asked) -> None:
 def entries(out: Path) -> dict[str, Any]:
     """What is noted, by name of the target; nothing if the list is missing or damaged."""
     try:
-        found = read_json(out / LIST)
+        content = read_json(out / LIST)
     except InputError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

@@ -52,11 +52,11 @@ def write(moments: Moments, folder: Path, progress: Progress, *, kind: str) -> N
 
 def views_of(moments: Moments, index: int) -> list[Camera]:
     """Where the index-th time is seen from: its own camera, and other poses of the sequence."""
-    own = moments.cameras[index]
+    camera = moments.cameras[index]
     poses = np.unique(moments.run.sequence().camera_from_world, axis=0)
     others = poses[np.linspace(0, len(poses) - 1, min(len(poses), VIEWS)).astype(int)]
-    moved = [pose for pose in others if not np.array_equal(pose, own.camera_from_world)]
-    return [own, *(own.at(pose) for pose in moved)] if can_turn(moments) else [own]
+    moved = [pose for pose in others if not np.array_equal(pose, camera.camera_from_world)]
+    return [camera, *(camera.at(pose) for pose in moved)] if can_turn(moments) else [camera]
 
 
 def can_turn(moments: Moments) -> bool:
@@ -75,11 +75,11 @@ def distances(moments: Moments, index: int, cameras: list[Camera]) -> Float[np.n
     for image in moments.run.images(times, cameras, RENDERED):
         distance = normalised(image["distance"], image["opacity"])
         images.append(np.where(image["opacity"] >= OPAQUE, distance, np.nan))
-    found = np.stack(images)
-    if np.isnan(found).all():
+    stacked = np.stack(images)
+    if np.isnan(stacked).all():
         why, fix = f"nothing is opaque at {times[0]:.6g} s", "choose other --times"
         raise UsageError("no surface to export", where=moments.run.path, why=why, fix=fix)
-    return found
+    return stacked
 
 
 def grid(

@@ -43,11 +43,11 @@ class Pixels:
 
 def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) -> None:
     """Fill a folder with one PLY file per time."""
-    for index, found in enumerate(pixels(moments, colour)):
-        places = world_points(found.distance, moments.cameras[index], found.seen)
-        columns = dict(zip("xyz", places, strict=True))
-        columns |= dict(zip(("red", "green", "blue"), found.rgb[found.seen].T, strict=True))
-        columns |= {n: getattr(found, n)[found.seen] for n in ("distance", "reflectivity")}
+    for index, rendered in enumerate(pixels(moments, colour)):
+        points = world_points(rendered.distance, moments.cameras[index], rendered.seen)
+        columns = dict(zip("xyz", points, strict=True))
+        columns |= dict(zip(("red", "green", "blue"), rendered.rgb[rendered.seen].T, strict=True))
+        columns |= {n: getattr(rendered, n)[rendered.seen] for n in ("distance", "reflectivity")}
         data = ply_bytes(table(columns), [*moments.about(index), f"red, green, blue: {colour}"])
         write_through(moments.path(folder, index, "ply"), data)
         progress(index + 1, len(moments))

@@ -92,14 +92,16 @@ def packed(moments: Moments, progress: Progress, colour: str) -> Packed:
     Raises:
         UsageError: If that is too much, or nothing.
     """
-    found = survey(moments)
-    order = torch.cat([rows.nonzero()[:, 0] for rows in (found.rests, found.seen & ~found.rests)])
-    resting, field = int(found.rests.sum()), found.field.map(lambda tensor: tensor[order])
-    number = torch.full((len(found.seen),), -1)
+    surveyed = survey(moments)
+    order = torch.cat(
+        [rows.nonzero()[:, 0] for rows in (surveyed.rests, surveyed.seen & ~surveyed.rests)]
+    )
+    resting, field = int(surveyed.rests.sum()), surveyed.field.map(lambda tensor: tensor[order])
+    number = torch.full((len(surveyed.seen),), -1)
     number[order] = torch.arange(len(order))
-    places, log_scale = Quantiser.over(found.low, found.high), field.log_scale.numpy()
+    places, log_scale = Quantiser.over(surveyed.low, surveyed.high), field.log_scale.numpy()
     scales = Quantiser.over(log_scale.min(axis=0), log_scale.max(axis=0))
-    indices, moved, turns = zip(*moving(moments, found, number, places, progress), strict=True)
+    indices, moved, turns = zip(*moving(moments, surveyed, number, places, progress), strict=True)
     still = field.map(lambda tensor: tensor[:resting])
     harmonics = colour_harmonics(moments, colour).cpu()[order]
     shown = shown_colour(field, harmonics, moments, linear=colour != "colour")
@@ -168,7 +170,7 @@ def replaced(first: GaussianField, field: GaussianField, new: Bool[Tensor, "N"])
 
 def moving(
     moments: Moments,
-    found: Survey,
+    surveyed: Survey,
     number: Int[Tensor, "N"],
     places: Quantiser,
     progress: Progress,
@@ -176,7 +178,7 @@ def moving(
     """Index, place and turn of what does not rest, for each moment."""
     for index in range(len(moments)):
         field, there = at_moment(moments, index)
-        chosen = there & found.seen & ~found.rests
+        chosen = there & surveyed.seen & ~surveyed.rests
         moved = field.map(lambda tensor, chosen=chosen: tensor[chosen])
         yield number[chosen].numpy().astype("<u4"), places(moved.mean.numpy()), turned(moved)
         progress(index + 1, len(moments))

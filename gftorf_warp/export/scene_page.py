@@ -30,18 +30,18 @@ def write(moments: Moments, path: Path, progress: Progress, *, colour: str) -> N
     Raises:
         UsageError: If the page would be too large, or show nothing.
     """
-    found, cameras = packed(moments, progress, colour), moments.cameras
+    scene, cameras = packed(moments, progress, colour), moments.cameras
     about = {
-        **found.sizes,
+        **scene.sizes,
         "times": moments.times,
         "frames": moments.frames,
         "views": [np.round(one.camera_from_world, 7).ravel().tolist() for one in cameras],
         "camera": {name: getattr(cameras[0], name) for name in CAMERA},
         "low_pass": moments.run.render_settings.low_pass,
         "shown": colour,
-        "pivot": pivot(found.centre, cameras[0].camera_from_world),
+        "pivot": pivot(scene.centre, cameras[0].camera_from_world),
         "viridis": pictures.bar("viridis")[0].tolist(),
-        "arrays": base64.b64encode(found.arrays).decode("ascii"),
+        "arrays": base64.b64encode(scene.arrays).decode("ascii"),
     }
     atomic_write(path, document(moments.run.path.name, about))
 

@@ -58,9 +58,9 @@ def colour_harmonics(moments: Moments, colour: str) -> Float[Tensor, "N 16 3"]:
 
 def scaled(harmonics: Float[Tensor, "N 16 *c"], factor: float) -> Float[Tensor, "N 16 *c"]:
     """Harmonics of ``factor`` times what they describe, sum of Y h + 0.5."""
-    found = factor * harmonics
-    found[:, 0] += (factor - 1.0) * SH_BIAS / SH_Y0
-    return found
+    result = factor * harmonics
+    result[:, 0] += (factor - 1.0) * SH_BIAS / SH_Y0
+    return result
 
 
 def gaussians_at(moments: Moments, index: int, harmonics: Float[Tensor, "N 16 3"]) -> GaussianField:

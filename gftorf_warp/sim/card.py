@@ -22,9 +22,9 @@ CALLED = "frames size seed sync noise flow exposure_samples engine bounces paths
 """Settings that a call names on a data card, even where they are the defaults."""
 
 
-def settings_card(own: Scene, settings: SimSettings) -> str:
+def settings_card(requested: Scene, settings: SimSettings) -> str:
     """The part that depends on scene (without level) and settings alone: equal text, same data."""
-    scene, used = resolved(own, settings)
+    scene, used = resolved(requested, settings)
     sensor, noisy = scene.sensor, used.noise and scene.sensor.noise
     camera, n = scene.camera(used.size), used.exposure_samples
     mhz, quads = float(sensor.f_mod_hz) / 1e6, len(sensor.cycle)
@@ -72,7 +72,7 @@ def settings_card(own: Scene, settings: SimSettings) -> str:
 {scene.horizontal_fov_deg:g} deg wide. \
 {_light(scene, used)}.
 
-    {_command(own, used, settings.level)}
+    {_command(requested, used, settings.level)}
 
 Made by gftorf-warp {__version__}, \
 scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
@@ -111,8 +111,8 @@ a raw frame, all light included. contact_sheet.png is an overview; no program re
 def _light(scene: Scene, used: ResolvedSettings) -> str:
     lamp = "Light and camera coincide"
     if any(scene.emitter):
-        place = ", ".join(f"{1e3 * x:g}" for x in scene.emitter)
-        lamp = f"The light is at ({place}) mm in camera axes and casts shadows"
+        position = ", ".join(f"{1e3 * x:g}" for x in scene.emitter)
+        lamp = f"The light is at ({position}) mm in camera axes and casts shadows"
     if scene.beam_deg is not None:
         lamp += f"; it shines on {scene.beam_deg[0]:g} x {scene.beam_deg[1]:g} deg"
     if not used.bounces:
@@ -133,8 +133,8 @@ def _camera_rows(scene: Scene, used: ResolvedSettings) -> dict[str, str]:
     """Rows on camera motion and colour camera; empty for a static ToF camera at the origin."""
     rows = {}
     if scene.camera_path != Still():
-        own = "; every raw frame has the pose of its own time" if scene.camera_moves else ""
-        rows["camera path"] = f"{scene.camera_path}{own}"
+        note = "; every raw frame has the pose of its own time" if scene.camera_moves else ""
+        rows["camera path"] = f"{scene.camera_path}{note}"
     if (colour := scene.colour) is not None:
         camera = scene.colour_camera(used.size)
         position = ", ".join(f"{1e3 * x:g}" for x in colour.position)

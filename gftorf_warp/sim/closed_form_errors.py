@@ -43,8 +43,8 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
     quartets = sequence.complete_quartets
     quartets = quartets[1:-1] if len(quartets) > 2 else quartets
     if truth is None or not quartets:
-        found = f"{'no ' if truth is None else ''}truth and {quartets}"
-        why = f"expected truth and a complete quartet, found {found}"
+        actual = f"{'no ' if truth is None else ''}truth and {quartets}"
+        why = f"expected truth and a complete quartet, found {actual}"
         fix = f"simulate at least the {sequence.cycle} raw frames of a cycle"
         where = sequence.path or "sequence"
         raise InputError("nothing to compare", where=where, why=why, fix=fix)

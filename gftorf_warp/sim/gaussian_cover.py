@@ -206,8 +206,8 @@ def cover_moving(
         distances = outside  # from the bounding sphere: a grid that is finer than it has to be
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
-        found = f"clearance {nearest:.3f} m must be above 0"
-        raise ValueError(f"a moving body reaches the camera: {found}")
+        why = f"clearance {nearest:.3f} m must be above 0"
+        raise ValueError(f"a moving body reaches the camera: {why}")
     focal = camera.fx * magnification(camera)
     spacing, variance = SPACING * nearest / focal, LOW_PASS + RADIUS**2
     inset = spread(SPACING * nearest / typical, variance) * typical / focal - spacing / 2

@@ -126,11 +126,11 @@ def cupboard() -> tuple[Body, ...]:
 def deskbox() -> tuple[Body, ...]:
     """A carton is carried in an arc onto a desk with a dark screen."""
     wood = plain(0.4, WOOD)
-    place = {"x": Curve(start=-0.42, eased=0.42), "y": Curve(start=0.27, arched=-0.12)}
+    curves = {"x": Curve(start=-0.42, eased=0.42), "y": Curve(start=0.27, arched=-0.12)}
 
     def carried(arm: Vector = (0.0, 0.0, 0.0)) -> Path:
         turn = Turn(axis="y", angle=Curve(eased=25.0))
-        return Guided(**place, z=Curve(start=2.10, eased=-0.10), turns=(turn,), arm=arm)
+        return Guided(**curves, z=Curve(start=2.10, eased=-0.10), turns=(turn,), arm=arm)
 
     return (
         *_room(3.3, 1.06, 0.5, 0.35),

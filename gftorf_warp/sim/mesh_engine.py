@@ -180,10 +180,10 @@ def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray
     corners = np.indices((2, 2, 2)).reshape(3, 8).T - 0.5
     faces = []
     for axis, u, v in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # u x v points along the axis
-        place = 4 >> np.array([axis, u, v])  # of a corner's number, per axis
+        weight = 4 >> np.array([axis, u, v])  # of a corner's number, per axis
         for side in (0, 1):
             around = ((0, 0), (1, 0), (1, 1), (0, 1))
-            square = [int(np.dot((side, a, b), place)) for a, b in around]
+            square = [int(np.dot((side, a, b), weight)) for a, b in around]
             turned = square if side != shape.inside else square[::-1]
             faces += [turned[:3], [turned[0], turned[2], turned[3]]]
     return corners * np.asarray(shape.size), np.array(faces)

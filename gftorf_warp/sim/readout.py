@@ -60,8 +60,8 @@ def why_impossible(sensor: Sensor) -> str | None:
         return None
     kind = "one tap allows" if sensor.unipolar else "differential taps allow"
     harmonics = f", peak {height:g} with its harmonics" if sensor.harmonic_contrast else ""
-    found = f"{share:g} (1 + {offset:g}){harmonics}"
-    return f"{kind} contrast (1 + |dc_offset|) <= 1, not {found}"
+    actual = f"{share:g} (1 + {offset:g}){harmonics}"
+    return f"{kind} contrast (1 + |dc_offset|) <= 1, not {actual}"
 
 
 def mean_quad(

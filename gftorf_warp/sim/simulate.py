@@ -73,15 +73,15 @@ def simulate(
     '# demo: simulated C-ToF sequence'
     """
     settings = replace(settings, **changes)
-    own = scene_of(scene, settings.overrides, settings.seed)
+    requested = scene_of(scene, settings.overrides, settings.seed)
     settings = replace(settings, overrides=())
-    recorded, used = resolved(own, settings)
+    recorded, used = resolved(requested, settings)
     check_numbers(recorded)
     _check_resources(recorded, used, Path(out))
     check_engine(recorded, used, device)
     check_format(recorded, used)
     check_clearance(recorded, longest_times(recorded, used))
-    card = settings_card(own, settings)
+    card = settings_card(requested, settings)
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
         return out
@@ -147,10 +147,10 @@ def scene_of(scene: str | Scene, overrides: Iterable[str] = (), seed: int = 0) -
         return overridden(scene, overrides)
     if scene.endswith(".toml"):
         return overridden(read_scene(scene), overrides)
-    found = named_scene(scene, seed)
-    if found is None:
+    chosen = named_scene(scene, seed)
+    if chosen is None:
         others = "take one of these, `--list` describes them, or a file that ends in .toml"
         named = *SCENES, PREFIX, f"{PREFIX}-N"
         why, fix = f"the named scenes are {', '.join(named)}", did_you_mean(scene, named, others)
         raise UsageError(f"there is no scene named {scene!r}", where="SCENE", why=why, fix=fix)
-    return overridden(found, overrides)
+    return overridden(chosen, overrides)

@@ -35,7 +35,7 @@ def sweep(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Result]:
-    """Simulate, reconstruct and score all that a plan asks for, and write tables of it.
+    """Simulate, reconstruct and score all that a plan lists, and write tables of it.
 
     What is done with the same settings and data is not done again, and a run that was interrupted
     goes on from its checkpoint: the same call continues a sweep. OUT has ``scenes/``, ``runs/``

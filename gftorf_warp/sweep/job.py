@@ -127,8 +127,8 @@ def _fitted(task: Task, place: Place) -> Result:
     folder, preset = run_of(job, task.out), job.row.preset
     forget_peak_memory(place.device)  # of the job before in this process
     run = _patiently(lambda: reconstruct(sequence, folder, preset, **chosen))
-    metrics, found = score(run, frames=plan.frames)
-    _keep_picture(picture_of(job, task.out), found)
+    metrics, comparison = score(run, frames=plan.frames)
+    _keep_picture(picture_of(job, task.out), comparison)
     memory = peak_memory(place.device)
     about = {"seconds": run.config.get("seconds_reconstruct"), "gaussians": run.gaussians}
     about |= {name: run.config[name] for name in ("assumed",) if name in run.config}
@@ -158,14 +158,14 @@ def _while_parent_lives():
     return check
 
 
-def _keep_picture(path: Path, found: Comparison) -> None:
+def _keep_picture(path: Path, comparison: Comparison) -> None:
     """Distance, truth and closed form of the frame with the most to see, as float16 [m]."""
-    s = telling_row(found)
-    images = {"d": found.views.d[s], "closed_form": found.views.closed_form[s]}
-    if found.judgement is not None:
-        images["error"] = np.sqrt(found.judgement.errors["d"][s])
-        images["closed_form_error"] = np.sqrt(found.judgement.errors["closed_form"][s])
-        images["truth"] = found.judgement.truth[s]
+    s = telling_row(comparison)
+    images = {"d": comparison.views.d[s], "closed_form": comparison.views.closed_form[s]}
+    if comparison.judgement is not None:
+        images["error"] = np.sqrt(comparison.judgement.errors["d"][s])
+        images["closed_form_error"] = np.sqrt(comparison.judgement.errors["closed_form"][s])
+        images["truth"] = comparison.judgement.truth[s]
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **{k: image.astype(np.float16) for k, image in images.items()})

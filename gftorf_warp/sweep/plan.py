@@ -213,9 +213,9 @@ def read_plan(path: str | Path) -> Plan:
     return plan
 
 
-def _check_keys(found: Iterable[str], known: Iterable[str], path: Path, where: str = "") -> None:
+def _check_keys(given: Iterable[str], known: Iterable[str], path: Path, where: str = "") -> None:
     known = list(known)
-    for key in found:
+    for key in given:
         if key not in known:
             hint = did_you_mean(key, known, f"there are {', '.join(known)}")
             raise _wrong(path, where + key, f"there is no such key: {hint}")
@@ -296,9 +296,9 @@ def _recording(options: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _published(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, tuple[float, ...]]]:
-    found: dict[str, dict[str, tuple[float, ...]]] = {}
+    published: dict[str, dict[str, tuple[float, ...]]] = {}
     for name, errors in tables.items():
-        where, found[name] = f"published.{name}", {}
+        where, published[name] = f"published.{name}", {}
         if not isinstance(errors, dict):
             raise _wrong(path, where, "expected a table: scene = error of d, or [d, d_ToF]")
         for scene, given in errors.items():
@@ -306,5 +306,5 @@ def _published(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, tup
             if not 1 <= len(numbers) <= 2 or not all(type(x) in (int, float) for x in numbers):
                 why = f"expected an error of d, or [d, d_ToF], found {given!r}"
                 raise _wrong(path, f"{where}.{scene}", why)
-            found[name][scene] = tuple(map(float, numbers))
-    return found
+            published[name][scene] = tuple(map(float, numbers))
+    return published

@@ -134,12 +134,12 @@ def stated_results(path: str | Path | None = None) -> dict[str, Stated]:
     Raises:
         InputError: If it cannot be read.
     """
-    found = {}
+    results = {}
     for name, content in read_toml(Path(path or FILE)).items():
         values = {key: tuple(numbers) for key, numbers in content.pop("values").items()}
         seeds = tuple(content.pop("seeds"))
-        found[name] = Stated(name=name, seeds=seeds, values=values, **content)
-    return found
+        results[name] = Stated(name=name, seeds=seeds, values=values, **content)
+    return results
 
 
 def stated_result(name: str, path: str | Path | None = None) -> Stated:
@@ -194,14 +194,14 @@ def reproduce(
             what, fix = f"{stated.name} cannot be done again", f"see {log}"
             raise GftorfError(what, where=result["id"], why=result["error"], fix=fix)
     metrics = [results[job.id]["metrics"] for job in plan.fits]
-    found = []
+    reproduced = []
     for key in stated.values:
         least, mean, largest = stated.bounds(key)
         values = [look_up(scores, key) for scores in metrics]
         by_seed = tuple(math.nan if value is None else float(value) for value in values)
         about = {"stated": mean, "least": least, "largest": largest}
-        found.append(Reproduced(key=key, by_seed=by_seed, **about))
-    return found
+        reproduced.append(Reproduced(key=key, by_seed=by_seed, **about))
+    return reproduced
 
 
 def listed(rows: Mapping[str, Stated]) -> str:
@@ -210,7 +210,7 @@ def listed(rows: Mapping[str, Stated]) -> str:
     return "\n".join(f"{row.name:<{width}}  {row.device:<4}  {row.about}" for row in rows.values())
 
 
-def table(stated: Stated, found: Sequence[Reproduced]) -> str:
+def table(stated: Stated, reproduced: Sequence[Reproduced]) -> str:
     """Stated and measured numbers side by side, and the verdict."""
     lines = [
         f"{stated.name}: {stated.about}",
@@ -218,20 +218,20 @@ def table(stated: Stated, found: Sequence[Reproduced]) -> str:
         f"spread: {stated.spread_from}",
         f"{UNIT:<22}{'stated':>10}{'spread':>22}{'measured':>12}",
     ]
-    for one in found:
+    for one in reproduced:
         spread = f"{one.least:.4g} .. {one.largest:.4g}"
         numbers = f"{one.stated:>10.4g}{spread:>22}{one.measured:>12.4g}"
         lines.append(f"{TITLES[one.key]:<22}{numbers}  {'within' if one.within else 'outside'}")
-    outside = [TITLES[one.key] for one in found if not one.within]
+    outside = [TITLES[one.key] for one in reproduced if not one.within]
     verdict = f"outside the stated spread: {'; '.join(outside)}" if outside else "all within"
     return "\n".join([*lines, verdict])
 
 
-def as_json(stated: Stated, found: Sequence[Reproduced]) -> str:
+def as_json(stated: Stated, reproduced: Sequence[Reproduced]) -> str:
     """The same for other programs."""
     numbers = {
         one.key: dataclasses.asdict(one) | {"measured": one.measured, "within": one.within}
-        for one in found
+        for one in reproduced
     }
-    within = all(one.within for one in found)
+    within = all(one.within for one in reproduced)
     return json.dumps({"name": stated.name, "within": within, "numbers": numbers}, indent=2)

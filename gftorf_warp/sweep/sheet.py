@@ -24,9 +24,9 @@ def sheet(plan: Plan, scene: Scene, out: Path) -> Picture | None:
     All distances have one colour scale and all errors another, those of truth and closed form.
     """
     images = {
-        row.name: found
+        row.name: stored
         for row in plan.rows
-        if (found := _stored(picture_of(Job(scene=scene, row=row, seed=plan.seeds[0]), out)))
+        if (stored := _stored(picture_of(Job(scene=scene, row=row, seed=plan.seeds[0]), out)))
     }
     if not images:
         return None

@@ -48,7 +48,7 @@ def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
     lines: list[Line] = []
     for scene in plan.scenes:
         by_row = _by_row(plan, scene, results)
-        every = [result for found in by_row.values() for result in found]
+        every = [result for of_row in by_row.values() for result in of_row]
         if every:
             lines.append(_closed_form(scene, every[0]))
         for row in plan.rows:
@@ -106,8 +106,8 @@ def failures(results: Iterable[Result]) -> list[str]:
 
 
 def assumptions(plan: Plan, results: Mapping[str, Result]) -> list[str]:
-    """What was not published, or is done in another way, a line each after the rows that it is said
-    of; of rows that all publish, or nobody does, nothing is.
+    """What of the rows was not published, or is done in another way: a line for each statement,
+    after the names of its rows. A row without such a statement is not named.
     """
     rows: dict[str, dict[str, None]] = {}
     for job in plan.fits:
@@ -148,10 +148,10 @@ def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture
         body += page.section("What cannot be applied", f"<ul>{items}</ul>")
     lines = lines_of(plan, results)
     for scene in plan.scenes:
-        own = [line for line in lines if line.scene == scene.name]
+        of_scene = [line for line in lines if line.scene == scene.name]
         picture = sheets.get(scene.name)
         shown = "" if picture is None else page.plain_picture(picture, scene.name, "all rows")
-        body += page.section(page.escape(scene.name), _html(own, [*COLUMNS, *COSTS]), shown)
+        body += page.section(page.escape(scene.name), _html(of_scene, [*COLUMNS, *COSTS]), shown)
     if notes := assumptions(plan, results):
         listed = "".join(f"<li>{page.escape(note)}</li>" for note in notes)
         body += page.section("Not as published (*)", f"<ul>{listed}</ul>")
@@ -178,12 +178,12 @@ def _about(plan: Plan) -> str:
 
 def _by_row(plan: Plan, scene: Scene, results: Mapping[str, Result]) -> dict[str, list[Result]]:
     """Good results of every row on a scene, one per seed."""
-    found: dict[str, list[Result]] = {row.name: [] for row in plan.rows}
+    by_row: dict[str, list[Result]] = {row.name: [] for row in plan.rows}
     for job in plan.fits:
         result = results.get(job.id)
         if job.scene == scene and job.row is not None and result and "metrics" in result:
-            found[job.row.name].append(result)
-    return found
+            by_row[job.row.name].append(result)
+    return by_row
 
 
 def _closed_form(scene: Scene, result: Result) -> Line:
@@ -193,18 +193,18 @@ def _closed_form(scene: Scene, result: Result) -> Line:
     return Line(scene=scene.name, row=CLOSED_FORM, cells=cells, kind="closed")
 
 
-def _line(scene: Scene, name: str, found: Sequence[Result]) -> Line:
+def _line(scene: Scene, name: str, results: Sequence[Result]) -> Line:
     cells = {}
     for title, key in COLUMNS.items():
         percent = title == "not explained"
-        values = [page.look_up(result["metrics"], key) for result in found]
+        values = [page.look_up(result["metrics"], key) for result in results]
         if text := _spread([100.0 * v if percent else v for v in values if v is not None]):
             cells[title] = text + (" %" if percent else "")
     for title, key in COSTS.items():
-        values = [result[key] for result in found if result.get(key) is not None]
+        values = [result[key] for result in results if result.get(key) is not None]
         if values:
             cells[title] = f"{np.mean(values):{'.1f' if title == 'seconds' else '.0f'}}"
-    marked = name + MARK if any(result.get("assumed") for result in found) else name
+    marked = name + MARK if any(result.get("assumed") for result in results) else name
     return Line(scene=scene.name, row=marked, cells=cells, kind="ours")
 
 
@@ -221,11 +221,11 @@ def _spread(values: Sequence[float]) -> str:
     return mean if low == high else f"{mean} ({low} to {high})"
 
 
-def _ratio(found: Sequence[Result], title: str) -> float | None:
+def _ratio(results: Sequence[Result], title: str) -> float | None:
     """Mean error over seeds over that of the closed form on the same pixels; None: not known."""
     key = COLUMNS[title]
     below = key.replace("d_tof_mse", "closed_form_mse").replace("d_mse", "closed_form_mse")
-    pairs = [[page.look_up(r["metrics"], k) for k in (key, below)] for r in found]
+    pairs = [[page.look_up(r["metrics"], k) for k in (key, below)] for r in results]
     known = [(above, under) for above, under in pairs if above is not None and under]
     return sum(a for a, _ in known) / sum(b for _, b in known) if known else None
 

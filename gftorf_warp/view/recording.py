@@ -31,8 +31,8 @@ class Recording:
 
     def __init__(self, sequence: Sequence):
         self.sequence = sequence
-        found = read_truth(sequence)
-        self.truth = None if found is None else known_distance(found)
+        truth = read_truth(sequence)
+        self.truth = None if truth is None else known_distance(truth)
         self._cameras = [camera_of(sequence, n) for n in range(sequence.frames)]
         self._decoded = Held(HELD)
 

@@ -141,24 +141,24 @@ def _quads(subject: Subject, n: int) -> dict[str, Shown]:
 def distances_of(subject: Subject, n: int) -> dict[str, Float[np.ndarray, "H W"]]:
     """All distances [m] that are known at a raw frame, by title."""
     ours, recorded = subject.ours(n), subject.recording
-    found = {
+    by_title = {
         CLOSED_FORM: recorded.closed_form(n),
         OURS: None if ours is None else ours["distance"],
         TRUTH: recorded.true_distance(n),
     }
-    return {title: distance for title, distance in found.items() if distance is not None}
+    return {title: distance for title, distance in by_title.items() if distance is not None}
 
 
 def _standing(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "H W"]]:
     """Distances [m] of what stands in the scene, by title."""
-    found = distances_of(subject, choice.frame)
+    distances = distances_of(subject, choice.frame)
     everything = choice.beside or subject.run is None
-    return {title: d for title, d in found.items() if everything or title == OURS}
+    return {title: d for title, d in distances.items() if everything or title == OURS}
 
 
 def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
     """Points of ours if they are wanted as points, of closed form and truth beside them."""
-    n, camera, found = choice.frame, subject.recording.camera(choice.frame), []
+    n, camera, drawn = choice.frame, subject.recording.camera(choice.frame), []
     for title, distance in _standing(subject, choice).items():
         if title == OURS and choice.shape == SPLATS:
             continue
@@ -168,18 +168,18 @@ def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
         points = world_points(distance, camera, seen).T + _place(subject, title)
         rgb = cloud_colours(subject, n, choice.colour, title)[seen]
         given = {"points": points.astype(np.float32), "rgb": rgb, "pixels": np.argwhere(seen)}
-        found.append(Cloud(title=title, **given))
-    return found
+        drawn.append(Cloud(title=title, **given))
+    return drawn
 
 
 def marks(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]:
-    """Where the chosen pixel is in every shape [m], by title; unknown distances have no place."""
+    """Where the chosen pixel is in every shape [m], by title; unknown distances have no mark."""
     camera, (y, x) = subject.recording.camera(choice.frame), choice.pixel
     ray = camera.rays()[y, x].numpy()
-    found = {title: float(d[y, x]) for title, d in _standing(subject, choice).items()}
+    distances = {title: float(d[y, x]) for title, d in _standing(subject, choice).items()}
     return {
         title: camera.centre + distance * ray + _place(subject, title)
-        for title, distance in found.items()
+        for title, distance in distances.items()
         if distance > 0  # NaN is not
     }
 
@@ -212,11 +212,11 @@ def cloud_colours(subject: Subject, n: int, colour: str, title: str) -> UInt8[np
     amplitude.
     """
     shown = pictures_of(subject, n, colour)
-    own = shown.get(title) or shown.get(f"error of {title}")
-    if own is None and title == OURS and colour in ("chi-square", "quads") and shown:
-        own = next(iter(shown.values()))
-    if own is not None:
-        return pictures.colour_mapped(own[0].astype(np.float32), own[1])
+    picture = shown.get(title) or shown.get(f"error of {title}")
+    if picture is None and title == OURS and colour in ("chi-square", "quads") and shown:
+        picture = next(iter(shown.values()))
+    if picture is not None:
+        return pictures.colour_mapped(picture[0].astype(np.float32), picture[1])
     image = subject.recording.amplitude(n)
     if image is None:
         return np.full((*subject.sequence.quads[n].shape, 3), 160, np.uint8)
@@ -263,13 +263,13 @@ def _splat_colours(
 
 
 def pixel_on_ray(
-    found: list[Cloud], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    candidates: list[Cloud], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
 ) -> tuple[int, int] | None:
     """The pixel (y, x) of the point that a ray passes nearest to, seen from its origin; None if
     none is within two degrees.
     """
     best, pixel = np.cos(np.radians(2.0)), None
-    for cloud in found:
+    for cloud in candidates:
         if not len(cloud.points):
             continue
         apart = cloud.points - origin

@@ -45,13 +45,13 @@ class Stage:
             self._draw_splats(scene.splats(self.subject, choice))
             self._draw_clouds(scene.clouds(self.subject, choice))
             self._draw_cameras(choice)
-            for title, place in scene.marks(self.subject, choice).items():
-                given = {"radius": MARK_PX * self._pixel_m, "color": MARK, "position": place}
+            for title, position in scene.marks(self.subject, choice).items():
+                given = {"radius": MARK_PX * self._pixel_m, "color": MARK, "position": position}
                 name = f"/marks/{_path(title)}"
                 self._keep(self.server.scene.add_icosphere(name, **given))
-            for title, place in scene.titles(self.subject, choice).items():
+            for title, position in scene.titles(self.subject, choice).items():
                 name = f"/titles/{_path(title)}"
-                self._keep(self.server.scene.add_label(name, title, position=place))
+                self._keep(self.server.scene.add_label(name, title, position=position))
             names = {handle.name for handle in self._drawn}
             for handle in before:
                 if handle.name not in names:  # those of the same name are replaced already
@@ -66,24 +66,24 @@ class Stage:
     def _keep(self, handle: Any) -> None:
         self._drawn.append(handle)
 
-    def _draw_splats(self, found: scene.Splats | None) -> None:
-        if found is None:
+    def _draw_splats(self, splats: scene.Splats | None) -> None:
+        if splats is None:
             return
         from viser.transforms import SO3
 
-        turn = SO3(found.quaternion).as_matrix()
-        axes = turn * found.scale[:, None, :]
+        turn = SO3(splats.quaternion).as_matrix()
+        axes = turn * splats.scale[:, None, :]
         handle = self.server.scene.add_gaussian_splats(
             "/splats",
-            centers=found.centre,
+            centers=splats.centre,
             covariances=(axes @ axes.transpose(0, 2, 1)).astype(np.float32),
-            rgbs=found.rgb.astype(np.float32),
-            opacities=found.opacity[:, None],
+            rgbs=splats.rgb.astype(np.float32),
+            opacities=splats.opacity[:, None],
         )
         self._keep(handle)
 
-    def _draw_clouds(self, found: list[scene.Cloud]) -> None:
-        for cloud in found:
+    def _draw_clouds(self, clouds: list[scene.Cloud]) -> None:
+        for cloud in clouds:
             handle = self.server.scene.add_point_cloud(
                 f"/clouds/{_path(cloud.title)}",
                 points=cloud.points,

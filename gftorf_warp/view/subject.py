@@ -88,13 +88,13 @@ class Subject:
 
     def reload(self) -> bool:
         """Read the newest checkpoint if there is a newer one than before; whether there was."""
-        if self.run is None or (found := newest(self.path)) == self.state:
+        if self.run is None or (state := newest(self.path)) == self.state:
             return False
         try:
             run = _opened(self.path, self.run.field.device, self._moved)
         except InputError as error:  # it is written again in a moment, or started over
             LOG.warning("the newest checkpoint was not read: %s", error.what)
-            self.state = found
+            self.state = state
             return False
         self._take(run)
         return True
@@ -134,10 +134,10 @@ class Subject:
         # corrections of a run that goes on would be decided anew for every state
         if self.finished and f == self.sequence.frequencies[0]:
             image = self.run.corrected(fit, time, camera)
-        found = {k: getattr(image, k).cpu().numpy().copy() for k in ("distance", "opacity")}
+        arrays = {k: getattr(image, k).cpu().numpy().copy() for k in ("distance", "opacity")}
         shifts = self.sequence.shifts[: self.sequence.cycle]
         slots = [quad_of_shift(fit, self.run.sensor, float(shift)) for shift in shifts]
-        return found | {"slots": np.stack([slot.cpu().numpy() for slot in slots])}
+        return arrays | {"slots": np.stack([slot.cpu().numpy() for slot in slots])}
 
     def ours(self, n: int) -> Mapping[str, np.ndarray] | None:
         """Images of the run at the first frequency, see :meth:`rendered`; None: there is no
@@ -152,10 +152,10 @@ class Subject:
 
     def chi_square(self, n: int) -> Float[np.ndarray, "h w"] | None:
         """Of the quartet of a raw frame [1], at the size of the fit; None: not known."""
-        found, i = self.residuals, n // self.sequence.cycle
-        if found is None or not found.noisy or i not in found.quartets:
+        residuals, i = self.residuals, n // self.sequence.cycle
+        if residuals is None or not residuals.noisy or i not in residuals.quartets:
             return None
-        return found.chi_square[found.quartets.index(i)]
+        return residuals.chi_square[residuals.quartets.index(i)]
 
 
 def _opened(path: Path, device: torch.device | str, sequence: str | Path | None) -> Run:

@@ -22,8 +22,8 @@ from .controls import Controls
 from .stage import Stage
 from .subject import Subject
 
-HOST = "127.0.0.1"  # nobody else on the network can connect
-ASK_EVERY_S = 1.0  # [s] between two looks for a newer checkpoint
+HOST = "127.0.0.1"  # not reachable from other machines
+ASK_EVERY_S = 1.0  # [s] between two checks for a newer checkpoint
 
 
 class Window:
@@ -114,9 +114,9 @@ class Window:
         """Choose the pixel on a ray."""
         self._ray = None
         points = replace(self.controls.choice, shape=scene.POINTS)
-        found = scene.pixel_on_ray(scene.clouds(self.subject, points), origin, direction)
-        if found is not None:
-            self.controls.row.value, self.controls.column.value = found
+        pixel = scene.pixel_on_ray(scene.clouds(self.subject, points), origin, direction)
+        if pixel is not None:
+            self.controls.row.value, self.controls.column.value = pixel
 
     def _look_through(self) -> None:
         """So that a click meets a pixel."""
