@@ -325,7 +325,7 @@ def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
 
 def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
     emitter = light_paths.Emitter()
-    emitter.place = wp.vec3(*lamp.position)
+    emitter.position = wp.vec3(*lamp.position)
     across, down = lamp.beam_deg or (0.0, 0.0)
     emitter.limited = lamp.beam_deg is not None
     emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))

@@ -151,9 +151,9 @@ def collect(
         gradients[begin + VALUES * WIDTH + n] = head_sum[n]
         return
     at = begin + n * inputs + input
-    own = input  # among what enters a layer beside the one before
+    encoded = input  # index among the encodings, which follow the outputs of the layer before
     if number > 0:
-        own -= WIDTH
+        encoded -= WIDTH
     total = float(0.0)
     if input == inputs:
         at = begin + WIDTH * inputs + n
@@ -161,14 +161,14 @@ def collect(
             total += sums[number, key, n]
     elif number == form.layers:
         total = total_of(of_head, 0, n * WIDTH + input)
-    elif own < 0:
+    elif encoded < 0:
         total = total_of(of_outputs, (number - 1) * HALVES + n // HALF, n % HALF * WIDTH + input)
-    elif own < form.position:
+    elif encoded < form.position:
         job = n // HALF
         if number > 0:
             job += HALVES
-        total = total_of(of_places, job, n % HALF * COLUMNS + own)
+        total = total_of(of_places, job, n % HALF * COLUMNS + encoded)
     else:
         for key in range(sums.shape[1]):
-            total += sums[number, key, n] * time[key, own - form.position]
+            total += sums[number, key, n] * time[key, encoded - form.position]
     gradients[at] = total * unit[0]

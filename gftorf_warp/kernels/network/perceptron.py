@@ -94,10 +94,10 @@ def pack(
     """
     at = wp.tid() * UNIT
     if at >= forth.shape[0] + back.shape[0] + head.shape[0]:
-        own = (at - forth.shape[0] - back.shape[0] - head.shape[0]) // UNIT
-        n = own % WIDTH
-        key = own // WIDTH % time.shape[0]
-        number = own // (WIDTH * time.shape[0])
+        shift = (at - forth.shape[0] - back.shape[0] - head.shape[0]) // UNIT
+        n = shift % WIDTH
+        key = shift // WIDTH % time.shape[0]
+        number = shift // (WIDTH * time.shape[0])
         shifts[number, key, n] = shift_of(form, parameters, time, number, key, n)
         return
     if at >= forth.shape[0] + back.shape[0]:

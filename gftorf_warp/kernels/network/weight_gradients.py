@@ -28,14 +28,14 @@ def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, in
     """(parts for outputs, parts for gamma(x), multiprocessors left for these), by bytes read."""
     jobs, others = HALVES * (layers - 1), HALVES * entries
     read, also = jobs * (HALF + WIDTH), others * (HALF + COLUMNS)
-    own = max(multiprocessors * read // ((read + also) * jobs), 1) if jobs else 1
-    left = max(multiprocessors - own * jobs, 1)
-    return own, max(2 * left // others, 1), left
+    output_parts = max(multiprocessors * read // ((read + also) * jobs), 1) if jobs else 1
+    left = max(multiprocessors - output_parts * jobs, 1)
+    return output_parts, max(2 * left // others, 1), left
 
 
 def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     """C++ of a product: layer of a job, offset of its inputs, and input row of a listed row."""
-    own = columns // 4  # inputs of a warp
+    warp_inputs = columns // 4
     pieces = columns // 8  # of 16 bytes in a row
     abreast = 32 // pieces  # rows that a warp copies at once
     stage = TILE * 2 * (HALF + columns)  # bytes of a tile
@@ -106,8 +106,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
                      : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
                      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(low), "r"(high));
     }};
-    const int m = warp / 4 * 64, n = warp % 4 * {own};  // outputs and inputs of this warp
-    float sums[4][{own // 8}][4] = {{}};
+    const int m = warp / 4 * 64, n = warp % 4 * {warp_inputs};  // outputs and inputs of this warp
+    float sums[4][{warp_inputs // 8}][4] = {{}};
     __syncthreads();  // the last readers of this memory
     for (int tile = begin; tile < begin + {STAGES - 1}; ++tile) {{
         if (tile < end) fetch(tile);
@@ -122,7 +122,7 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int k = 0; k < {TILE}; k += 16) {{
-            unsigned a[4][4], b[{own // 16}][4];
+            unsigned a[4][4], b[{warp_inputs // 16}][4];
             #pragma unroll
             // 8 rows, the next 8 of the outputs, both again 8 rows on
             for (int i = 0; i < 4; ++i) {{
@@ -130,7 +130,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
                 turned(a[i], stage + row * {2 * HALF} + (piece ^ row & 7) * 16);
             }}
             #pragma unroll
-            for (int j = 0; j < {own // 16}; ++j) {{  // 8 rows, 8 rows on, both again 8 inputs on
+            // 8 rows, 8 rows on, both again 8 inputs on
+            for (int j = 0; j < {warp_inputs // 16}; ++j) {{
                 const int row = k + lane / 8 % 2 * 8 + lane % 8, piece = n / 8 + 2 * j + lane / 16;
                 turned(b[j], stage + {TILE * 2 * HALF} + row * {2 * columns} + (piece ^ row & 7)
                     * 16);
@@ -138,14 +139,14 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
             #pragma unroll
             for (int i = 0; i < 4; ++i)
                 #pragma unroll
-                for (int j = 0; j < {own // 8}; ++j)
+                for (int j = 0; j < {warp_inputs // 8}; ++j)
                     multiply(sums[i][j], a[i], b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1]);
         }}
     }}
     #pragma unroll
     for (int i = 0; i < 4; ++i)
         #pragma unroll
-        for (int j = 0; j < {own // 8}; ++j) {{
+        for (int j = 0; j < {warp_inputs // 8}; ++j) {{
             float* const at = to + (m + 16 * i + lane / 4) * {columns} + n + 8 * j + lane % 4 * 2;
             *reinterpret_cast<float2*>(at) = make_float2(sums[i][j][0], sums[i][j][1]);
             *reinterpret_cast<float2*>(at + {8 * columns}) =

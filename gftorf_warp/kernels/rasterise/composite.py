@@ -182,11 +182,11 @@ def make_composite(
         if segment < wp.static(segments - 1):
             states[segment * wp.static(PLANES), tile, lane] = T
         if segment > 0:
-            place = (segment - 1) * wp.static(PLANES)
-            states[place + 1, tile, lane] = re
-            states[place + 2, tile, lane] = im
-            states[place + 3, tile, lane] = amplitude
-            states[place + 4, tile, lane] = distance
+            plane = (segment - 1) * wp.static(PLANES)
+            states[plane + 1, tile, lane] = re
+            states[plane + 2, tile, lane] = im
+            states[plane + 3, tile, lane] = amplitude
+            states[plane + 4, tile, lane] = distance
 
     @wp.kernel(**options(K))
     def composite(

@@ -284,12 +284,12 @@ def make_composite_backward(
             for m in range(wp.static(segments - 1)):
                 end_of = wp.static(segments - 2) - m
                 if end_of >= segment:
-                    place = end_of * wp.static(PLANES)
-                    lit = mul(g_re, states[place + 1, tile, lane])
-                    lit = fma(lit, g_im, states[place + 2, tile, lane])
-                    lit = fma(lit, g_amplitude, states[place + 3, tile, lane])
-                    E = add(E, fma(add(lit, lit), g_distance, states[place + 4, tile, lane]))
-                    T = states[place, tile, lane]
+                    plane = end_of * wp.static(PLANES)
+                    lit = mul(g_re, states[plane + 1, tile, lane])
+                    lit = fma(lit, g_im, states[plane + 2, tile, lane])
+                    lit = fma(lit, g_amplitude, states[plane + 3, tile, lane])
+                    E = add(E, fma(add(lit, lit), g_distance, states[plane + 4, tile, lane]))
+                    T = states[plane, tile, lane]
         zeta0 = float(0.0)
         if wp.static(spreads):
             if begin < k:

@@ -42,7 +42,7 @@ def fill_bins(
     keys: wp.array[wp.int32],  # [>= N] of each splat
     culled: int,  # key of culled splats [1]
     shift: int,  # lowest bits of a key, which its bin ignores [1]
-    first: wp.array[int],  # [COUNTS] first place of each bin
+    first: wp.array[int],  # [COUNTS] first rank of each bin
     places: wp.array[wp.int32],  # [N] of each splat in its bin
     # Out:
     members: wp.array[wp.int64],  # [N] (key << 32 | index) of every splat, bin by bin
@@ -59,18 +59,18 @@ def order_within_bins(
     members: wp.array[wp.int64],  # [N] key and index of every splat, bin by bin
     culled: int,  # key of culled splats [1]
     shift: int,  # lowest bits of a key, which its bin ignores [1]
-    first: wp.array[int],  # [COUNTS] first place of each bin
+    first: wp.array[int],  # [COUNTS] first rank of each bin
     # Out:
     order: wp.array[wp.int32],  # [>= N] splats near to far
 ):
     """A thread per splat, neighbours in one bin."""
     at = wp.tid()
-    own = members[at]
-    key = int(own >> wp.int64(32))
-    place = at
+    member = members[at]
+    key = int(member >> wp.int64(32))
+    rank = at
     if key != culled:
         number = bin_of(key, culled, shift)
-        place = first[number]
+        rank = first[number]
         for other in range(first[number], first[number + 1]):
-            place += int(members[other] < own)
-    order[place] = int(own & wp.int64(0xFFFFFFFF))
+            rank += int(members[other] < member)
+    order[rank] = int(member & wp.int64(0xFFFFFFFF))

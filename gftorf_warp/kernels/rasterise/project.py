@@ -149,9 +149,9 @@ def make_project(
         scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
         if wp.static(lens):
             cov = bent_covariance(camera, local, quaternion[n], scale)
-            place = distorted(camera, local[0] / local[2], local[1] / local[2])
-            x = camera.fx * place[0] + camera.cx
-            y = camera.fy * place[1] + camera.cy
+            image = distorted(camera, local[0] / local[2], local[1] / local[2])
+            x = camera.fx * image[0] + camera.cx
+            y = camera.fy * image[1] + camera.cy
         else:
             cov = screen_covariance(camera, local, quaternion[n], scale)
             x = camera.fx * local[0] / local[2] + camera.cx

@@ -33,7 +33,7 @@ ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path
 class Emitter:
     """A point of light that shines into a pyramid about the z axis of the camera."""
 
-    place: wp.vec3  # in camera axes [m]; zero: at the camera, without shadows
+    position: wp.vec3  # in camera axes [m]; zero: at the camera, without shadows
     limited: bool  # whether it shines into the pyramid only, not into all directions
     spread: wp.vec2  # tangents of half the angles across and down [1]; unused if not limited
     cycles: float  # modulation frequency over the speed of light [1/m]
@@ -88,7 +88,7 @@ def received(
     may_be_hidden: bool,
 ) -> wp.vec2:
     """Returned amplitude of the emitter's light and its distance [m], both at ``point``."""
-    towards = point - emitter.place
+    towards = point - emitter.position
     reach = wp.length(towards)
     turn = rotation[instant, hit.body]
     cosine = -wp.dot(turn * towards, hit.normal) / reach
@@ -99,7 +99,7 @@ def received(
     if cosine > 0.0 and may_be_hidden:
         limit = reach * (1.0 - SHADOW_GAP)
         ray = towards / reach
-        first = nearest(solids, rotation, translation, instant, emitter.place, ray, limit)
+        first = nearest(solids, rotation, translation, instant, emitter.position, ray, limit)
         if first.body >= 0:
             cosine = float(0.0)
     if cosine > 0.0 and emitter.power != 0.0:
@@ -145,7 +145,7 @@ def trace_light(
     y = first + stride * i
     total = float(0.0)
     even = float(0.0)
-    beside = wp.length_sq(emitter.place) > 0.0
+    beside = wp.length_sq(emitter.position) > 0.0
     for h in range(harmonics.shape[0]):
         light[h, y, x] = wp.vec2(0.0, 0.0)
     for t in range(rotation.shape[0]):
@@ -206,7 +206,7 @@ def trace_bounces(
         point = hit.distance * ray
         length = hit.distance
         weight = float(1.0)
-        own = wp.vec2(0.0, 0.0)
+        of_path = wp.vec2(0.0, 0.0)
         for _bounce in range(bounces):
             if hit.body >= 0:
                 solid = solids[hit.body]
@@ -230,11 +230,11 @@ def trace_bounces(
                 got = received(emitter, solids, rotation, translation, t, hit, point, ray, True)
                 total += weight * got[0]
                 turns = emitter.cycles * (length + got[1])
-                own += turned(float(harmonics[0]) * turns, weight * got[0])
+                of_path += turned(float(harmonics[0]) * turns, weight * got[0])
                 for h in range(1, harmonics.shape[0]):
                     light[h, y, x] += turned(float(harmonics[h]) * turns, weight * got[0])
-        light[0, y, x] += own
-        squares += wp.length_sq(own)
+        light[0, y, x] += of_path
+        squares += wp.length_sq(of_path)
     share = 1.0 / float(paths)
     amplitude[y, x] = share * total
     for h in range(harmonics.shape[0]):
