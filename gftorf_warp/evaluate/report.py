@@ -138,7 +138,7 @@ def _by_class(metrics: Mapping[str, Any]) -> list[str]:
     """The section of errors at edges and on slopes; none without truth."""
     if page.look_up(metrics, "classes") is None:
         return []
-    text = "Root mean squared error by what the true distance looks like around a pixel."
+    text = "Root mean squared error by the shape of the true distance around a pixel."
     more = "<summary>In m² &times; 100, all distances and slopes</summary>"
     details = f"<details>{more}{tables.by_class(metrics)}</details>"
     return [

@@ -171,7 +171,7 @@ def _by_class(runs: Sequence[Scored]) -> list[str]:
     coloured = zip(runs, cycle(RUN_COLOURS), strict=False)
     series |= {run.name: tables.Series(colour, run.metrics, "d") for run, colour in coloured}
     bars = tables.bars(series)
-    text = "Root mean squared error by what the true distance looks like around a pixel."
+    text = "Root mean squared error by the shape of the true distance around a pixel."
     return [page.section("Edges and slopes", page.caption(text), bars)] if bars else []
 
 

@@ -16,7 +16,7 @@ class Imported:
     understood: tuple[str, ...]
     """What was read and how it was taken, a line each, with the source of every value."""
     uncertain: tuple[str, ...] = ()
-    """What a layout does not say and was assumed, or looks wrong; a sentence each, a warning."""
+    """What a layout does not say and was assumed, or seems wrong; a sentence each, a warning."""
     truth: Truth | None = None
     """Ground truth, if the source has it."""
 
@@ -28,4 +28,4 @@ class Notes:
     understood: list[str] = field(default_factory=list)
     """What was read and how it was taken."""
     uncertain: list[str] = field(default_factory=list)
-    """What was assumed, or looks wrong."""
+    """What was assumed, or seems wrong."""

@@ -30,7 +30,7 @@ def binding_of(
     motion: Motion,
     binding: Float[Tensor, "B M"],
 ) -> Float[Tensor, "N M"]:
-    """How the Gaussians of an edited field hang on the motion of a run.
+    """Binding (:meth:`Motion.bind`) of the Gaussians of an edited field to the motion of a run.
 
     Args:
         field: The edited Gaussians.
@@ -79,7 +79,7 @@ def save(
         config: Of the run.
         field: Its Gaussians now.
         motion: Their motion.
-        binding: How they hang on it.
+        binding: Their binding to it.
 
     Raises:
         InputError: If ``run`` has no checkpoint any more that can be read.

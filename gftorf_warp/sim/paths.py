@@ -130,7 +130,7 @@ class Arc(Path):
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint(Path):
-    """A static camera that looks at a point."""
+    """A static camera that faces a point."""
 
     position: Vector
     """Position in the world [m]."""
@@ -145,7 +145,7 @@ class Viewpoint(Path):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Path):
-    """A camera that swings to and fro on a horizontal arc about a point that it looks at."""
+    """A camera that swings to and fro on a horizontal arc about a point that it faces."""
 
     middle: Vector
     """Middle of the arc [m]."""

@@ -43,7 +43,7 @@ class StoredRun:
     motion: Motion
     """Where they are at which time."""
     binding: Float[Tensor, "N M"] = dataclasses.field(repr=False)
-    """How each Gaussian hangs on the motion."""
+    """What the motion needs of each Gaussian, see :meth:`Motion.bind`."""
 
     @classmethod
     def _of(
