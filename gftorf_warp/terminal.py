@@ -27,7 +27,7 @@ OUT_OF_MEMORY = (
     *("can't allocate memory", "Failed to allocate", "Insufficient memory", "std::bad_alloc"),
     *("can't start new thread", "failed to map segment"),
 )
-# of Warp, when the machine code of a kernel is not in memory; no class tells it
+# of Warp, when the machine code of a kernel is not in memory; no class identifies it
 LOST_KERNEL = re.compile(r"Failed to (find (forward|backward) kernel|load CPU module)")
 
 

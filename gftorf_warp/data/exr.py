@@ -27,7 +27,7 @@ from .untrusted import CHANNELS_MAX, PARTS_MAX, SIDE_MAX, check_unpacked
 TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}
 
 _PRINTING = threading.Lock()
-if hasattr(os, "register_at_fork"):  # a forked process must not inherit another thread's turn
+if hasattr(os, "register_at_fork"):  # a forked process must not inherit another thread's lock
     _release = _PRINTING.release
     os.register_at_fork(before=_PRINTING.acquire, after_in_parent=_release, after_in_child=_release)
 

@@ -23,7 +23,7 @@ from jaxtyping import Complex, Float
 
 STRIDES = (1, 2, 3)  # [px] between the two pixels of a pair: one is often less than the noise
 EXPONENTS = (2.0, 2.5, 3.0)  # p of a frontal and of a tilted surface
-# and of what is stated, in dubio pro reo: light that bounces, balls and lenses that darken corners
+# and of what is stated, the more lenient: indirect light, balls and lenses that darken corners
 LENIENT = (1.5, *EXPONENTS, 4.0, 6.0)
 CAP = 0.7  # [1] c: a factor of two in amplitude between neighbours is an outline, not fall-off
 SAME_SURFACE_RAD = 0.4  # [rad] phases of neighbours that differ more belong to two surfaces

@@ -36,7 +36,7 @@ def captioned(panels: Sequence[Panel], title: str, least: int | None = None) -> 
     """Pictures of one height in a row; those of one scale share a colour bar.
 
     Pixels are enlarged to squares, so that colours stay those of the scale. Width and height are
-    even, as video codecs want. ``least`` is the least width of each [px]; None: what suits so many.
+    even, as video codecs need. ``least`` is the least width of each [px]; None: what suits so many.
     """
     height, width = panels[0].image.shape[:2]
     least = least or (ALONE if len(panels) == 1 else IN_A_ROW)

@@ -167,7 +167,7 @@ class Writing:
             raise self._ended(connection) from error
 
     def _receive(self, *, wait_for_one: bool) -> None:
-        """Handle replies of the processes, waiting for at least one if asked to."""
+        """Handle replies of the processes, and with ``wait_for_one`` wait for one."""
         ready = wait([one for one, busy in self._busy.items() if busy], None if wait_for_one else 0)
         for connection in [one for one in self._busy if one in ready]:
             try:

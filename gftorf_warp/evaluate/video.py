@@ -1,7 +1,7 @@
 """Videos and animations of pictures: WebM and MP4 by VP9, GIF, and WebP.
 
 OpenCV's own FFmpeg encodes VP9, which browsers and usual players show from either file; it has
-no encoder for H.264, which some office programs want.
+no encoder for H.264, which some office programs need.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _counted(
 
 
 def _held(pictures: Iterator[Picture], total: int, where: Path) -> list[Picture]:
-    """All pictures in memory, as the encoder of animations wants them."""
+    """All pictures in memory, which the encoder of animations needs."""
     held = []
     for picture in pictures:
         if total * picture.nbytes > HELD_BYTES_MAX:

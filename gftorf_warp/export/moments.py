@@ -69,7 +69,7 @@ class Moments:
         return self.run.images(self.times, self.cameras, sorted(wanted))
 
     def path(self, folder: Path, index: int, suffix: str) -> Path:
-        """File of the index-th time: a common prefix and a number, as viewers of sequences want."""
+        """File of the index-th time: a common prefix and a number, for viewers of sequences."""
         digits = max(DIGITS, len(str(len(self) - 1)))
         return folder / f"frame_{index:0{digits}d}.{suffix}"
 

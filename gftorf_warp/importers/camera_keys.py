@@ -19,7 +19,7 @@ PINHOLE = {
 
 
 def camera_keys(table: str, who: str, *, needed: bool) -> tuple[Key, ...]:
-    """Keys of the lens of a camera in a table; ``needed``: whether somebody has to give them."""
+    """Keys of the lens of a camera in a table; ``needed``: whether they are required."""
     single = tuple(
         Key(
             name=f"{table}.{name}",

@@ -32,11 +32,11 @@ class Key:
     about: str
     """What it means, with unit, in a line."""
     example: Any
-    """A value as people would write it, shown where there is no default."""
+    """A value as in the file, shown where there is no default."""
     default: Any = None
     """Value where the file has none; None: not given."""
     needed: bool = False
-    """Whether somebody has to give it, since no default is right."""
+    """Whether it is required, since no default is right."""
     unless: tuple[str, ...] = ()
     """Keys that replace a needed one."""
     shape: tuple[int | None, ...] = ()

@@ -104,7 +104,7 @@ class Diagnostics:
         return _mark(after, total) > _mark(before, total)
 
     def rewind(self, images: int) -> None:
-        """Drop rows beyond ``images``: the run goes on from there."""
+        """Drop rows beyond ``images``, from which the run is continued."""
         self.rows.rewind(images)
 
     def add(self, state: State, settings: ReconSettings) -> Row:

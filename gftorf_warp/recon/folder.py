@@ -26,14 +26,14 @@ FRESH = (
     "old run is kept aside)"
 )
 IDENTITY = ("seed", "data_sha256", "windows")
-"""What has to agree for a run to go on, besides the settings."""
+"""What has to agree for a run to be continued, besides the settings."""
 
 
 def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     """Make the folder ready for a run with this config.
 
     Returns:
-        True if it already holds this run, so that it goes on; False if it is new.
+        True if it already holds this run, which is then continued; False if it is new.
 
     Raises:
         UsageError: If the folder holds something else, or the same run with other settings.
@@ -80,7 +80,7 @@ REMOVED = {"volume.grid.moving_rate": 1.0}
 
 
 def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
-    """What keeps a run from going on under a new config, in words. A longer run is the same run.
+    """Differences for which a run cannot be continued under a new config. A longer run is the same.
 
     A setting that a run is too old to know has its default: what it says then is what was always
     done, or as good.

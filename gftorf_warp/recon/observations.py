@@ -262,7 +262,7 @@ def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
 
 
 def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
-    """The sequence with the optical flow that the settings ask for, and where it is from."""
+    """The sequence with the optical flow that the settings choose, and where it is from."""
     given = bool(sequence.flow.forward or sequence.flow.backward)
     if source == FlowSource.NONE:
         return replace(sequence, flow=Flow()), "none"

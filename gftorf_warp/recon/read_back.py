@@ -122,7 +122,7 @@ def _sensor(stored: dict[str, Any]) -> Sensor:
     numbers = [value for name, value in stored.items() if name != "further_hz"]
     if not all(isinstance(value, NUMBER) for value in [*numbers, *further]):
         raise ValueError(f"sensor must hold numbers, found {stored}")
-    Calibration(f_mod_hz=float(stored["f_mod_hz"]))  # is it in hertz?
+    Calibration(f_mod_hz=float(stored["f_mod_hz"]))  # raises a ValueError if it is not in hertz
     return sensor
 
 

@@ -318,8 +318,8 @@ class ReconSettings:
     rollbacks_max: int = 3
     """Returns to a checkpoint before the run ends as diverged."""
     fallback: bool = False
-    """Whether the finished run's distance gives way to the measurement where that knows better, see
-    recon/fallback.py; the optimisation is the same."""
+    """Whether measured distances replace those of the finished run where they are more accurate,
+    see recon/fallback.py; the optimisation is the same."""
     outlines: bool = False
     """Whether mixed pixels of the finished run have the distance of the surface at their centre,
     see recon/outlines.py; the optimisation is the same."""

@@ -209,7 +209,7 @@ def _check_resources(
 
 
 def _check_flow(sequence: Sequence, flow: FlowSource) -> None:
-    """Raise a UsageError if the sequence's own optical flow is asked for and it has none."""
+    """Raise a UsageError if the sequence's own optical flow is chosen and it has none."""
     if flow == FlowSource.FILE and not (sequence.flow.forward or sequence.flow.backward):
         raise UsageError(
             "no optical flow to read",

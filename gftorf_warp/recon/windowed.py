@@ -29,7 +29,7 @@ from .train import chosen_settings, reconstruct
 
 LOG = logging.getLogger("gftorf_warp")
 OVERLAP_QUARTETS = 2  # a seam then lies a quartet from the ends of both windows: design/long.md
-ROUNDING = 1e-6  # [quartets] of seconds that somebody typed
+ROUNDING = 1e-6  # [quartets] of seconds given in decimals
 
 
 def reconstruct_in_windows(
@@ -97,7 +97,7 @@ def reconstruct_in_windows(
                 )
                 gaussians += run.gaussians
                 del run
-                gc.collect()  # a run and its sequence refer to each other: the next one needs room
+                gc.collect()  # a run and its sequence refer to each other: frees memory
             folder.write_config(out, config | _finished(out, count) | {"gaussians": gaussians})
     return Run.open(out, device)
 

@@ -88,7 +88,7 @@ class Rasterize(torch.autograd.Function):
             learns = any(ctx.needs_input_grad)  # otherwise these are the launches of a replay
             launch.forward(_inputs(named), view, buffers, _images(images), differentiable=learns)
         ctx.save_for_backward(*tensors)
-        ctx.state = request, view, buffers, buffers.turns
+        ctx.state = request, view, buffers, buffers.renderings
         if "distance_median" in images:
             ctx.mark_non_differentiable(images["distance_median"])
         return tuple(images.get(name) for name in IMAGES)
@@ -98,8 +98,8 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """Launch the adjoints explicitly, without tape or global state, into new tensors."""
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
-        request, view, buffers, turn = ctx.state
-        if buffers.turns != turn:
+        request, view, buffers, rendering = ctx.state
+        if buffers.renderings != rendering:
             raise ValueError(
                 "its workspace has rendered again since: call backward before the "
                 "next rendering with it"

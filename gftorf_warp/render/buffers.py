@@ -205,7 +205,7 @@ class Buffers:
 
         self._arrays: dict[str, wp.array] = {}
         self._planes: dict[str, Planes] = {}
-        self.turns = 0  # renderings so far
+        self.renderings = 0  # number so far
         self.splats = self.array("splats", count, Splat)
         self.box_px = self.array("boxes", count, wp.vec4i)
         self.depth_shift = settings.depth_shift

@@ -96,7 +96,7 @@ def forward(
     inputs: Inputs, view: View, buffers: Buffers, images: Images, *, differentiable: bool = True
 ) -> None:
     """Project, sort, composite, resolve; images that are None are not computed."""
-    buffers.turns += 1
+    buffers.renderings += 1
     groups = channel_groups(inputs)
     buffers.channels = [
         buffers.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))

@@ -1,4 +1,4 @@
-"""Warp in this process: its start, its messages in our log, and whose turn it is to launch.
+"""Warp in this process: its start, its messages in our log, and the lock of launches.
 
 Warp's modules, tape and streams belong to the process. Two threads that launch at once can crash
 while one of them loads a module, and on CUDA one would set the stream of the other.
@@ -17,7 +17,9 @@ LOG = logging.getLogger("gftorf_warp")
 LAUNCHING = threading.RLock()
 """Held while kernels are launched; the threads of a launch (side_by_side.py) do not need it."""
 
-if hasattr(os, "register_at_fork"):  # a forked process must not inherit another thread's turn
+if hasattr(
+    os, "register_at_fork"
+):  # a forked process must not inherit a lock that another thread holds
     _release = LAUNCHING.release
     os.register_at_fork(before=LAUNCHING.acquire, after_in_parent=_release, after_in_child=_release)
 

@@ -131,8 +131,8 @@ class Light:
     """
 
     light: Complex[np.ndarray, "h H W"]
-    """Sum of amplitude exp(i phase) at each harmonic of the modulation that was asked for [relative
-    units]."""
+    """Sum of amplitude exp(i phase) at each harmonic of the requested modulation
+    [relative units]."""
     amplitude: Float[np.ndarray, "H W"]
     """Sum of the amplitudes [relative units]: at least the length of each ``light``."""
     direct: Complex[np.ndarray, "h H W"]

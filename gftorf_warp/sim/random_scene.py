@@ -36,7 +36,7 @@ NEAR = 0.6  # [m] between camera and bodies, at any frequency
 APART = 1.1  # [m] the same in the middle of the sequence, where bodies are placed
 WALL, WALLS = 0.2, 5  # [m] thickness of walls, and their number
 ORDERS = (CANONICAL_SHIFTS, CANONICAL_SHIFTS, PALINDROMIC, SEQUENTIAL)
-LOOK, SEEN = (80, 60), 30  # [px] an image, and the pixels of it in which a moving body is seen
+SMALL, SEEN = (80, 60), 30  # [px] an image, and the pixels of it in which a moving body is seen
 STANDING = 0.999  # [1] height of poles over that of the room
 FILLED = 0.25  # [1] largest share of the image that a body may fill
 
@@ -212,9 +212,9 @@ def _is_seen(scene: Scene) -> bool:
     """Whether no body fills the image, and every moving one is seen at some time."""
     most = np.zeros(len(scene.bodies), dtype=np.int64)
     for time in TIMES[[0, FRAMES // 2, -1]].tolist():
-        hit = first_hit(scene.bodies, scene.camera(LOOK), time).body
+        hit = first_hit(scene.bodies, scene.camera(SMALL), time).body
         most = np.maximum(most, np.bincount(hit.ravel(), minlength=len(most)))
     moves = [body.moves for body in scene.bodies]
     return (
-        most[WALLS:].max() <= FILLED * LOOK[0] * LOOK[1] and most[moves].min(initial=SEEN) >= SEEN
+        most[WALLS:].max() <= FILLED * SMALL[0] * SMALL[1] and most[moves].min(initial=SEEN) >= SEEN
     )

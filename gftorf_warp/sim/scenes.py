@@ -19,7 +19,7 @@ from .scene import ColourCamera, Scene, recipe
 from .world import Body, Plane, Texture
 
 _ours = partial(recipe, frames=48, width=160, height=120)
-LOOKED_AT = (0.0, 0.1, 2.7)  # [m] by the camera of the tour
+TARGET = (0.0, 0.1, 2.7)  # [m] that the camera of the tour faces
 VIEWS = (
     (-0.45, -0.1, 0.0),
     (-0.2, -0.35, 0.1),
@@ -77,10 +77,10 @@ def arc() -> tuple[Body, ...]:
     2.488,
     frames=120,
     camera_path=Sweep(
-        middle=(0.0, 0.0, 0.0), target=LOOKED_AT, sweep_deg=9.0, period_s=2.0, rise=0.05
+        middle=(0.0, 0.0, 0.0), target=TARGET, sweep_deg=9.0, period_s=2.0, rise=0.05
     ),
     colour=ColourCamera(width=320, height=240, position=(0.04, 0.0, 0.0), noise=0.004),
-    novel_views=tuple(Viewpoint(position=at, target=LOOKED_AT) for at in VIEWS),
+    novel_views=tuple(Viewpoint(position=at, target=TARGET) for at in VIEWS),
 )
 def tour() -> tuple[Body, ...]:
     """A camera moves past a desk, as in the TöRF family: phasors, colour, poses."""

@@ -1,4 +1,4 @@
-"""What a sweep is asked for: a TOML file of scenes, presets, settings and seeds, and its jobs."""
+"""A sweep as a TOML file of scenes, presets, settings and seeds, and its jobs."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Job:
 
     @property
     def id(self) -> str:
-        """What tells it from other jobs, and the folder of its run below that of all."""
+        """Its name, unlike that of any other job, and the folder of its run in that of all runs."""
         row = "simulated" if self.row is None else f"{self.row.name}-{self.seed}"
         return f"{self.scene.name}/{row}"
 

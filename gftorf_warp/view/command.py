@@ -24,7 +24,7 @@ def view(
     sequence: str | Path | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a run or a sequence until Ctrl-C. A run that goes on is shown in its newest state.
+    """Show a run or a sequence until Ctrl-C; of an unfinished run, the newest state.
 
     It listens at 127.0.0.1 only, so only programs of this machine can connect.
 

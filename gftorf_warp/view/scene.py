@@ -30,7 +30,7 @@ Shown = tuple[Float[np.ndarray, "H W"], pictures.Scale]
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What somebody chose to see."""
+    """What the controls of the viewer are set to."""
 
     frame: int = 0
     """The raw frame n."""

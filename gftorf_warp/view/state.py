@@ -1,4 +1,4 @@
-"""Which state of a run is the newest, so that a viewer follows a reconstruction that goes on."""
+"""Which state of a run is the newest, so that a viewer follows an unfinished run."""
 
 from __future__ import annotations
 

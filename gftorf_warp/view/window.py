@@ -23,7 +23,7 @@ from .stage import Stage
 from .subject import Subject
 
 HOST = "127.0.0.1"  # not reachable from other machines
-ASK_EVERY_S = 1.0  # [s] between two checks for a newer checkpoint
+CHECK_EVERY_S = 1.0  # [s] between two checks for a newer checkpoint
 
 
 class Window:
@@ -48,7 +48,7 @@ class Window:
         self.server.gui.main_panel.dock_right()
         self._changed = threading.Event()
         self._ray: tuple[np.ndarray, np.ndarray] | None = None
-        self._last_asked, self._next_frame = time.monotonic(), 0.0
+        self._last_check, self._next_frame = time.monotonic(), 0.0
         self.stage = Stage(self.server, subject)
         self.controls = Controls(
             self.server.gui,
@@ -72,7 +72,7 @@ class Window:
     def run(self) -> None:
         """Draw whatever is chosen until KeyboardInterrupt."""
         while True:
-            self.step(ASK_EVERY_S)
+            self.step(CHECK_EVERY_S)
 
     def step(self, wait_s: float) -> bool:
         """Draw if something changed within ``wait_s`` [s]; whether something was drawn."""
@@ -87,8 +87,8 @@ class Window:
             frame = self.controls.frame
             frame.value = (int(frame.value) + 1) % self.subject.frames
             changed = True
-        if now > self._last_asked + ASK_EVERY_S:
-            self._last_asked = now
+        if now > self._last_check + CHECK_EVERY_S:
+            self._last_check = now
             changed |= self.subject.reload()
         if self._ray is not None:
             self._take_ray(*self._ray)

@@ -219,7 +219,7 @@ class Run(StoredRun):
         cameras: Iterable[Camera],
         images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
     ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
-        """:meth:`renderer` for a loop that wants arrays on the host: on CUDA, they come while the
+        """:meth:`renderer` with arrays on the host: on CUDA, they are copied while the
         next are rendered.
 
         Every image is whole, in the order of ``times``: one that needs more memory than was
