@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from gftorf_warp import Run
 from gftorf_warp.evaluate.compare import comparison_of
 from gftorf_warp.evaluate.metrics import scored_frames
-from gftorf_warp.evaluate.panels import telling_row
+from gftorf_warp.evaluate.panels import row_to_show
 from gftorf_warp.evaluate.views import gather
 
 INCHES = (12.0, 4.9)
@@ -36,7 +36,7 @@ def main() -> None:
     sequence = run.sequence()
     truth = sequence.truth()
     views = gather(run, sequence, scored_frames(sequence))
-    s = telling_row(comparison_of(sequence, views, truth))
+    s = row_to_show(comparison_of(sequence, views, truth))
     n = views.frames[s]
     true = truth.distance[n]
 

@@ -29,7 +29,7 @@ __all__ = ["__version__", *_HOME]  # noqa: PLE0604 - the names are strings, the 
 
 
 def __getattr__(name: str):
-    """Import the room that defines ``name``."""
+    """Import the package that defines ``name``."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

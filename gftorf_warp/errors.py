@@ -22,19 +22,19 @@ class GftorfError(Exception):
 
 
 class UsageError(GftorfError):
-    """The options cannot be meant that way."""
+    """Options that are invalid or contradict each other."""
 
     exit_code = 2
 
 
 class InputError(GftorfError):
-    """A file or folder is not what it has to be."""
+    """A file or folder is missing, damaged, or not of the expected kind."""
 
     exit_code = 3
 
 
 class DivergedError(GftorfError):
-    """The optimisation left the numbers; the last good checkpoint is kept."""
+    """A loss or a rendering is not finite; the last good checkpoint is kept."""
 
     exit_code = 4
 

@@ -211,7 +211,7 @@ def test_pictures_show_their_arrays(compared):
     the stated scale.
     """
     _, _, html, found = compared
-    s = panels.telling_row(found)
+    s = panels.row_to_show(found)
     metres = found.distance_scale
     assert (metres.low, metres.high) == (2.5, 4.0)
     quads = pictures.signed_scale([found.sequence.quads[n] for n in range(4, 8)])
@@ -281,7 +281,7 @@ def test_the_film_has_a_frame_for_every_quartet_start(compared):
 def test_sliders_lay_ours_over_the_closed_form(compared):
     """Distances and errors, pixel by pixel; without truth quads take the place of errors."""
     _, _, html, found = compared
-    s = panels.telling_row(found)
+    s = panels.row_to_show(found)
     for title, name in (("closed form", "closed_form"), ("ours, d", "d")):
         distance, error = (
             picture(html.images[f"slider: {prefix}{title}"][0]) for prefix in ("", "error of ")
@@ -485,12 +485,12 @@ def test_the_frame_shown_is_the_one_that_moves_most(compared):
     moving = np.zeros_like(found.judgement.moving)
     moving[7, :3] = moving[4, :1] = moving[11] = True
     assert (
-        panels.telling_row(replace(found, judgement=replace(found.judgement, moving=moving))) == 7
+        panels.row_to_show(replace(found, judgement=replace(found.judgement, moving=moving))) == 7
     )
     quads = np.zeros_like(found.sequence.quads)
     quads[9] = 1.0  # against frames 5 and 13; the first of the two in the middle half is shown
     blind = replace(found, judgement=None, sequence=replace(found.sequence, quads=quads))
-    assert found.views.frames[panels.telling_row(blind)] == 5
+    assert found.views.frames[panels.row_to_show(blind)] == 5
 
 
 def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):

@@ -77,11 +77,11 @@ def measure(
         wall = time.perf_counter() - begun
         report((number + 1) * total, 2 * total, kernels=name)
         row = {"kernels": name, "preset": preset, "set": changes, "wall_s": wall, "flow_s": flow_s}
-        rows.append(row | found_in(out))
+        rows.append(row | results_of(out))
     return rows
 
 
-def found_in(run: Path) -> dict[str, Any]:
+def results_of(run: Path) -> dict[str, Any]:
     """Length, size and curves of a finished run."""
     config = json.loads((run / "config.json").read_text())
     metrics, diagnostics = (

@@ -49,7 +49,7 @@ class ConstantPart:
 
     @property
     def is_zero(self) -> bool | None:
-        """Whether an additive zero explains it better; None: both do alike."""
+        """Whether an additive zero explains it better; None: both explain it equally well."""
         low, high = sorted((self.left_by_zero, self.left_by_dc))
         if high <= DC_TOLERANCE or low > DECIDED * high:
             return None

@@ -1,4 +1,4 @@
-"""Poses of a moving camera, tested by what quartets see: the same surface from two places.
+"""Poses of a moving camera, tested by quartets: they see the same surface from two viewpoints.
 
 Bright pixels of quartet i are placed in space with its pose, seen from the pose of quartet j, and
 compared with what j measured there. Distances test the convention of the poses: read the wrong way
@@ -43,7 +43,7 @@ CAP, CAP_LOG = 0.3, 0.5  # [1] an occlusion counts no more than this
 
 
 class Difference(NamedTuple):
-    """What two quartets see differently."""
+    """Differences between two quartets of one surface."""
 
     distance: float
     """Median relative difference of distances [1]."""

@@ -45,7 +45,7 @@ def _damaged(config: Mapping[str, Any]) -> str:
 
 
 def _edited(config: Mapping[str, Any]) -> str:
-    """About a run that no command makes again."""
+    """About a run that was edited, which no command repeats."""
     source = config.get("edited_from")
     return f"Its Gaussians were edited after the reconstruction in {source}." if source else ""
 
@@ -65,7 +65,7 @@ def _tried_again(config: Mapping[str, Any]) -> str:
 
 
 def _beyond_range(sequence: Sequence, truth: Truth | None) -> str:
-    """About true distances that the phase repeats."""
+    """About true distances beyond the unambiguous range."""
     if truth is None:
         return ""
     distance, most = known_distance(truth), unambiguous_range(sequence)

@@ -80,7 +80,7 @@ class Comparison:
         return pictures.distance_scale([self.judgement.truth])
 
 
-def telling_row(comparison: Comparison) -> int:
+def row_to_show(comparison: Comparison) -> int:
     """The row of the frame to show: in the middle half, the one with most moving pixels.
 
     Without ground truth, motion is estimated by the change between quads of one shift.
@@ -88,14 +88,14 @@ def telling_row(comparison: Comparison) -> int:
     count = len(comparison.views.frames)
     middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
 
-    def telling(s: int) -> tuple[float, float]:
+    def rank(s: int) -> tuple[float, float]:
         if comparison.judgement is None:
             changed = _change(comparison.sequence, comparison.views.frames[s])
         else:
             changed = float(comparison.judgement.moving[s].sum())
         return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
-    return max(middle, key=telling)
+    return max(middle, key=rank)
 
 
 def measured_quartet(comparison: Comparison, s: int) -> str:

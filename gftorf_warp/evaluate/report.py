@@ -46,7 +46,7 @@ def report(
     of the comparison, ``data_card`` the statement on the truth in the sequence's README, and
     ``simulated`` the command there that made it.
     """
-    s = panels.telling_row(comparison)
+    s = panels.row_to_show(comparison)
     # pictures are encoded without the GIL
     with KeptThreads("gftorf-report", available_threads()) as pool:
         distances = pool.submit(_distance_pictures, comparison, s)

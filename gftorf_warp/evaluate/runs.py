@@ -82,7 +82,7 @@ def compare_runs(
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """The last parts of each path, as few as tell all of them apart, and from what else the page
+    """The last parts of each path, as few as distinguish all of them, and from what else the page
     shows.
 
     Raises:
@@ -152,7 +152,7 @@ def _scored(
 ) -> Scored:
     judged, chi_square = comparison.judgement, None
     if comparison.residuals is not None and comparison.residuals.noisy:
-        shown = comparison.views.frames[panels.telling_row(comparison)] // comparison.sequence.cycle
+        shown = comparison.views.frames[panels.row_to_show(comparison)] // comparison.sequence.cycle
         chi_square = comparison.residuals.chi_square[comparison.residuals.quartets.index(shown)]
     return Scored(
         name=name,

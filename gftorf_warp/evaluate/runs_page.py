@@ -56,7 +56,7 @@ def page_of(title: str, comparison: Comparison, runs: Sequence[Scored]) -> str:
         comparison: The arrays of the first run: sequence, truth and closed form are those of all.
         runs: All of them.
     """
-    s = panels.telling_row(comparison)
+    s = panels.row_to_show(comparison)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.escape(runs[0].metrics["version"])}'

@@ -85,7 +85,7 @@ def error_cells(metrics: Mapping[str, Any], name: str) -> list[str]:
 
 
 def facts(metrics: Mapping[str, Any]) -> str:
-    """What else metrics.json says, with a word on each."""
+    """Other values of metrics.json, each with a short explanation."""
     items = "".join(
         f"<li><b>{page.number(metrics, key, form)}</b>{name}</li>"
         for name, key, form in FACTS

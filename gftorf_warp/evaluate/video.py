@@ -43,7 +43,7 @@ def checked(path: str | Path) -> Path:
 
 
 def rate_of(pictures: int) -> float:
-    """Pictures per second that let a few be seen: at least 4, at most 30."""
+    """Pictures per second, 4 to 30: few pictures are shown more slowly."""
     return float(np.clip(pictures / LONGEST_S, RATE_MIN, RATE_MAX))
 
 

@@ -105,13 +105,13 @@ def export(
     shown = colour or COLOURS[0 if moments.run.has_colour else 1]
     check_content(moments, names, shown)
     targets = {out / FORMATS[name].target: name for name in names}
-    asked = {
-        target: listed.asked_of(moments, shown if FORMATS[name].coloured else None)
+    descriptions = {
+        target: listed.described(moments, shown if FORMATS[name].coloured else None)
         for target, name in targets.items()
     }
     missing = [name for target, name in targets.items() if fresh or not target.exists()]
     check_resources(moments, missing, out)
-    remaining = listed.remaining(out, asked, fresh=fresh)
+    remaining = listed.remaining(out, descriptions, fresh=fresh)
     for target in (target for target in targets if target not in remaining):
         LOG.info("%s is finished", target)
     for target in remaining:
@@ -121,12 +121,12 @@ def export(
         if target.suffix:
             with as_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
-            listed.record(target, asked[target])
+            listed.record(target, descriptions[target])
             write(moments, target, step)
         else:
             with atomic_folder(target) as folder:
                 write(moments, folder, step)
-                listed.record(target, asked[target])
+                listed.record(target, descriptions[target])
     return [*targets]
 
 

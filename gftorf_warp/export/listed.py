@@ -20,10 +20,10 @@ from .moments import Moments
 LIST = "export.json"
 SUMS = ("ckpt/*.sha256", "windows/*/ckpt/*.sha256")  # of a run in windows, those of all
 DECISIVE = ("seed", "data_sha256", "settings", "images_optimised")
-Asked = Mapping[str, Any]
+Description = Mapping[str, Any]
 
 
-def asked_of(moments: Moments, colour: str | None) -> Asked:
+def described(moments: Moments, colour: str | None) -> Description:
     """What a format is made of: run, its state, times [s], and colour if the format has any."""
     run = moments.run
     known = {"run": str(run.path), "state_sha256": state(run), "times_s": moments.times}
@@ -43,38 +43,38 @@ def state(run: Run) -> str:
     return digest.hexdigest()
 
 
-def remaining(out: Path, asked: Mapping[Path, Asked], *, fresh: bool) -> list[Path]:
+def remaining(out: Path, descriptions: Mapping[Path, Description], *, fresh: bool) -> list[Path]:
     """Those of some targets in ``out`` that have to be made.
 
     Args:
         out: The folder of the export, which need not exist.
-        asked: What each target would be made of.
+        descriptions: What each target would be made of.
         fresh: Whether to move targets that exist to ``out/old-<k>``, the same ones too.
 
     Raises:
         UsageError: If one exists that was made of something else, and ``fresh`` is not set.
     """
-    held = [target for target in asked if target.exists()]
+    held = [target for target in descriptions if target.exists()]
     with as_errors(out):
         sweep(out / LIST)
         if fresh:
             if held:
                 set_aside(out, held)
-            return [*asked]
+            return [*descriptions]
     known = entries(out)
-    others = [target for target in held if known.get(target.name) != asked[target]]
+    others = [target for target in held if known.get(target.name) != descriptions[target]]
     if others:
         why = "an earlier export wrote it, of another state of the run, other times or colours"
         fix = "choose another --out, or --fresh, which moves it aside"
         raise UsageError("nothing is overwritten", where=others[0], why=why, fix=fix)
-    return [target for target in asked if target not in held]
+    return [target for target in descriptions if target not in held]
 
 
-def record(target: Path, asked: Asked) -> None:
+def record(target: Path, description: Description) -> None:
     """Note what a target is made of, just before it appears in its folder, which exists."""
     out = target.parent
     there = {name: entry for name, entry in entries(out).items() if (out / name).exists()}
-    write_json(out / LIST, there | {target.name: asked})
+    write_json(out / LIST, there | {target.name: description})
 
 
 def entries(out: Path) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""Codes of an analogue-to-digital converter as quads, and what no code says.
+"""Codes of an analogue-to-digital converter as quads, and pixels without a valid code.
 
     quad = code - zero,     code = bits lowest_bit .. lowest_bit + bits - 1 of the stored number
 
-A sequence has no place for a pixel that one raw frame did not measure. Such a pixel gets the value
-that the nearest raw frame of the same slot has there, the earlier one of two; a pixel that
-some slot never measured is without light, 0, in all raw frames. Both are counted and stated.
+A sequence cannot state that one raw frame did not measure a pixel. Such a pixel gets the
+value of the nearest raw frame of the same slot, the earlier one of two; a pixel that some slot
+never measured is without light, 0, in all raw frames. Both are counted and stated.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from ..similar import did_you_mean
 from .imported import Imported
 from .keys import load, template
 from .kinds import KINDS, Kind
-from .raw_files import check_room
+from .raw_files import check_resources
 
 LOG = logging.getLogger("gftorf_warp")
 README = "README.md"  # what was understood, in the capture
@@ -102,7 +102,7 @@ def import_recording(
     refuse_inexpressible("capture", imported.sequence, imported.truth)  # a dry run says so, too
     if out is not None:
         pixels = imported.sequence.height * imported.sequence.width
-        check_room(Need(disk=to_import(imported.sequence.frames, pixels).disk), Path(out))
+        check_resources(Need(disk=to_import(imported.sequence.frames, pixels).disk), Path(out))
     lines = [_summary(imported.sequence), *imported.understood]
     for text in imported.uncertain:
         LOG.warning("uncertain: %s", text)

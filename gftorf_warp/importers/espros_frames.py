@@ -18,7 +18,7 @@ from ..data.untrusted import SIDE_MAX
 from ..errors import InputError
 from .hdf5_files import MAGIC, checked, datasets, open_hdf5
 from .imported import Notes
-from .raw_files import check_room, files_of, raw_bytes, size_of
+from .raw_files import check_resources, files_of, raw_bytes, size_of
 
 # version, type, columns, rows, region of interest (left, top, right, bottom), three integration
 # times [us], temperature [0.01 degrees], offset of the data
@@ -62,7 +62,9 @@ def read_quartets(source: Path, turned: bool | None, notes: Notes) -> Quartets:
 def _raw(files: list[Path], notes: Notes) -> Quartets:
     """Quartets of raw frames, one after the other."""
     images, headers = [], []
-    check_room(to_open(2.0 * sum(map(size_of, files))), files[0].parent)  # and once more in a row
+    check_resources(
+        to_open(2.0 * sum(map(size_of, files))), files[0].parent
+    )  # and once more in a row
     for path in files:
         first, size = 0, size_of(path)
         while first < size:

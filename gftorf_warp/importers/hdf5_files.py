@@ -12,7 +12,7 @@ import numpy as np
 from ..data.resources import to_open
 from ..data.untrusted import PACKED_MAX, unreadable
 from ..errors import InputError, ResourceError
-from .raw_files import check_room
+from .raw_files import check_resources
 
 if TYPE_CHECKING:
     import h5py
@@ -93,7 +93,7 @@ def checked(path: Path, dataset: h5py.Dataset) -> np.ndarray:
     if dataset.size == 0 or dataset.nbytes > most:
         why = f"expected 1 to {most} bytes, found {dataset.nbytes} for shape {dataset.shape}"
         raise InputError("not complete", where=where, why=why, fix="copy or export the file again")
-    check_room(to_open(dataset.nbytes), path)
+    check_resources(to_open(dataset.nbytes), path)
     return np.asarray(dataset[()])
 
 

@@ -15,7 +15,7 @@ from ..data.resources import to_import
 from ..errors import InputError
 from .imported import Notes
 from .keys import Key, Settings
-from .raw_files import check_room, natural
+from .raw_files import check_resources, natural
 from .stacks import BY_AXES, SUFFIXES, Stack, open_stack
 
 SPARSE = 10  # raw frames per file: with more missing, the numbers count something else
@@ -103,7 +103,7 @@ def read_images(
         array = stack.array.transpose(order)
         if path == files[0]:
             images = len(files) * math.prod(array.shape[:-2]) * (1 + others)
-            check_room(to_import(images // taps, math.prod(array.shape[-2:])), path)
+            check_resources(to_import(images // taps, math.prod(array.shape[-2:])), path)
         for index in np.ndindex(array.shape[:-2]):
             yield path, array[index]
 

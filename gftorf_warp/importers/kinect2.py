@@ -115,7 +115,7 @@ def _dump(source: Path, notes: Notes) -> Dump:
 
 
 def _by_size(source: Path) -> Dump:
-    """All files by what their sizes say that they are.
+    """All files by kind, which follows from their sizes.
 
     Raises:
         InputError: If one is a table that was cut short.

@@ -34,7 +34,7 @@ def files_of(source: Path) -> list[Path]:
     return sorted(files, key=lambda path: natural(path.name))
 
 
-def check_room(need: Need, where: Path) -> None:
+def check_resources(need: Need, where: Path) -> None:
     """Check that memory and disk can hold a recording.
 
     Raises:

@@ -1,4 +1,4 @@
-"""F-TöRF and TöRF folders, which the program reads anyway, as captures with times of their own."""
+"""F-TöRF and TöRF folders, which :func:`read` accepts as well, as captures with other times."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
 from ..errors import GftorfError, InputError
 from . import hdf5_files
 from .keys import Key, Settings
-from .raw_files import check_room, size_of
+from .raw_files import check_resources, size_of
 
 NUMPY, ZIPPED = (".npy",), (".npz",)
 HDF5, MATLAB = (".h5", ".hdf5", ".he5"), (".mat",)
@@ -114,7 +114,7 @@ def open_stack(path: Path, settings: Settings) -> Stack:
     suffix, name = path.suffix.lower(), settings["source.dataset"]
     axes = None
     if suffix not in (*NUMPY, *RAW):
-        check_room(to_open(size_of(path)), path)
+        check_resources(to_open(size_of(path)), path)
     if suffix in NUMPY:
         array = map_array(path)
     elif suffix in ZIPPED:
@@ -152,7 +152,7 @@ def _zipped(path: Path, name: str | None) -> np.ndarray:
             size = path.stat().st_size
             if member.file_size > PACKED_MAX * size or member.compress_size > size:
                 raise ValueError(f"{member.file_size} bytes packed into {size}")
-            check_room(to_open(member.file_size), path)
+            check_resources(to_open(member.file_size), path)
         with np.load(path, allow_pickle=False) as arrays:
             return arrays[member.filename.removesuffix(".npy")]
     except GftorfError:

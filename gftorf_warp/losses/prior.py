@@ -1,4 +1,4 @@
-"""What is expected of a moving scene: it moves on the image as the optical flow says, and not much.
+"""Regularisers of motion: agreement with the optical flow, and small displacements.
 
 The third prior, depth distortion, is an output of the renderer: ``Rendering.distortion`` (method,
 section 2.7).

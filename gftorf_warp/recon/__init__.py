@@ -1,1 +1,1 @@
-"""What the camera must have seen: Gaussians and their motion, fitted to raw quads."""
+"""Reconstruction: Gaussians and their motion, fitted to raw quads."""

@@ -144,7 +144,7 @@ def _start(settings: ReconSettings, number: int) -> str:
 
 
 def _keep_better(state: State, judged: Judged, out: Path) -> bool:
-    """Take note of the end of the second attempt; True if the one before it was better."""
+    """Record the end of the second attempt; True if the one before it was better."""
     before = state.judged[-1]
     state.judged = [*state.judged, judged]
     worse = not _chi_square(judged) < _chi_square(before)

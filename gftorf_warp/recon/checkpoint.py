@@ -129,7 +129,7 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
 
 @contextlib.contextmanager
 def rebuilding(run: Path) -> Iterator[None]:
-    """Context in which what a checkpoint of a run holds is made into tensors and models again.
+    """Context in which the content of a checkpoint is made into tensors and models.
 
     Raises:
         InputError: If its parts do not fit together.
@@ -153,7 +153,7 @@ def after(run: Path, images: int) -> list[Path]:
 
 
 def _go_back(stored: dict, error: InputError) -> None:
-    """Say that an earlier state takes the place of what ``error`` is about.
+    """Log that an earlier state replaces the checkpoint that ``error`` is about.
 
     Raises:
         InputError: If nothing was optimised in that state.
@@ -226,7 +226,7 @@ def _target(temporary: Path) -> Path:
 
 
 def _foreign(error: Exception) -> str:
-    """What torch found in a checkpoint instead of tensors and plain values, in our words."""
+    """What a checkpoint contains besides tensors and plain values, by the error of torch."""
     named = re.search(r"GLOBAL (\S+)", str(error))
     return f"{named[1]}, which could run code" if named else "other content"
 

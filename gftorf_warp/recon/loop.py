@@ -48,7 +48,7 @@ class TrainingLoop:
         clock: Callable[[], float],
         progress: Progress | None,
     ):
-        """Take note of everything; :meth:`run` trains.
+        """Store the arguments; :meth:`run` trains.
 
         Args:
             observations: What is fitted.
@@ -207,7 +207,7 @@ def restarts(
 
 
 def _begin_again(fresh: State, state: State) -> None:
-    """Give a start what stays of the state that it replaces."""
+    """Copy to a new start what is kept of the state that it replaces."""
     fresh.restarts = state.restarts + 1
     for name in ("skipped", "rollbacks", "attempt", "judged", "other"):
         setattr(fresh, name, getattr(state, name))

@@ -1,4 +1,4 @@
-"""What a run leaves to read: metrics.jsonl, one JSON object per logged interval, and run.log."""
+"""The logs of a run: metrics.jsonl, one JSON object per logged interval, and run.log."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class Input(enum.StrEnum):
 
 
 class Norm(enum.StrEnum):
-    """How differences of colours are punished."""
+    """Norm of the differences of colours."""
 
     L1 = "l1"
     """Their absolute value."""

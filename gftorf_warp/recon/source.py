@@ -41,7 +41,7 @@ def sequence_of(run: Path, config: Mapping[str, Any]) -> Sequence:
 
 
 def link(run: Path, config: Mapping[str, Any], source: str | Path) -> dict[str, Any]:
-    """The config of a run whose sequence is in another folder now, which config.json remembers.
+    """The config of a run whose sequence was moved to another folder; updates config.json.
 
     Raises:
         InputError: If the folder holds no sequence, or another one.
@@ -50,15 +50,15 @@ def link(run: Path, config: Mapping[str, Any], source: str | Path) -> dict[str, 
     _checked(Path(source), run, config)
     try:
         with folder.locked(run):
-            remember(run, Path(source))
+            store_folder(run, Path(source))
     except (UsageError, OSError) as error:  # of a run that may only be read
-        text = "%s keeps the old place of the sequence: %s"
+        text = "%s keeps the old folder of the sequence: %s"
         LOG.warning(text, run / folder.CONFIG, str(error).partition("\n")[0])
     return {**config, "sequence": str(Path(source).resolve())}
 
 
-def remember(run: Path, source: Path) -> None:
-    """Let config.json name the folder of the sequence."""
+def store_folder(run: Path, source: Path) -> None:
+    """Store the folder of the sequence in config.json."""
     config, path = folder.read_config(run), str(source.resolve())
     if config.get("sequence") != path:
         folder.write_config(run, config | {"sequence": path})

@@ -274,7 +274,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     stored = checkpoint.last(out, device) if goes_on else None
     if stored is not None and attempts.are_over(stored, settings, out):
         if sequence.path is not None:  # it may have moved
-            source.remember(out, sequence.path)
+            source.store_folder(out, sequence.path)
         known = folder.read_config(out)
         if "explained" not in known:  # the process was killed after the last checkpoint
             attempts.conclude(out, known, stored, _judged(sequence, out, device))

@@ -34,7 +34,7 @@ STEPS = 6  # translations from the middle to the reach
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlongFlow:
-    """What the best candidate of every pixel makes of a quartet."""
+    """A quartet, decoded along the best candidate of every pixel."""
 
     flow: Float[Tensor, "2 h w"]
     """Displacement during the quartet [px]."""

@@ -32,7 +32,9 @@ from .changes import require
 from .gaussians import GaussianField
 
 LOG = logging.getLogger("gftorf_warp")
-NODE_FELLOWS = 8  # nearest points whose median displacement is the initial displacement of a node
+NODE_NEIGHBOURS = (
+    8  # nearest points whose median displacement is the initial displacement of a node
+)
 
 
 class Products(StrEnum):
@@ -303,7 +305,7 @@ class Nodes(Motion):
         nodes = farthest_points(moving, settings.nodes)
         offset = None
         if settings.from_tracks and initial.tracks is not None and len(nodes):
-            apart, fellows = torch.cdist(moving[nodes], moving), min(NODE_FELLOWS, len(moving))
+            apart, fellows = torch.cdist(moving[nodes], moving), min(NODE_NEIGHBOURS, len(moving))
             near = apart.topk(fellows, dim=1, largest=False).indices
             offset = initial.tracks[:, near].median(dim=2).values
         layer = field.layer[field.layer > 0][nodes]

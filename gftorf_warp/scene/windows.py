@@ -41,7 +41,7 @@ from .motion import (
 # displacement per axis of Gaussians outside their window [m]: beyond the far plane or beside the
 # image for every camera
 AWAY = 1e6
-NODE_FELLOWS = 24  # nearest points whose median velocity is the initial velocity of a node
+NODE_NEIGHBOURS = 24  # nearest points whose median velocity is the initial velocity of a node
 
 
 class Windows(Motion):
@@ -91,7 +91,7 @@ class Windows(Motion):
         for number in label.unique().tolist():
             members = (label == number).nonzero()[:, 0]
             chosen = members[farthest_points(mean[members], settings.nodes)]
-            fellows = min(NODE_FELLOWS, len(members))
+            fellows = min(NODE_NEIGHBOURS, len(members))
             near = (
                 torch.cdist(mean[chosen], mean[members]).topk(fellows, dim=1, largest=False).indices
             )

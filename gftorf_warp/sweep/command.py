@@ -69,12 +69,15 @@ def sweep(
     now = plan if rows is None else plan.only(rows)
     out = Path(out).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    with locked(out, ".sweep.lock", "sweep"), _doers(now, devices, workers, scheduler) as doers:
+    with (
+        locked(out, ".sweep.lock", "sweep"),
+        _executor_of(now, devices, workers, scheduler) as executor,
+    ):
         results = read_results(out / STORE)
         done, total = 0, len(now.recordings) + len(now.fits)
         for jobs in (now.recordings, now.fits):
             tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
-            for task, outcome in _outcomes(doers, tasks, results):
+            for task, outcome in _outcomes(executor, tasks, results):
                 result = _result(task, outcome)
                 if "error" in result or result["key"] != _key(results, task.job):
                     _store(out / STORE, result)
@@ -95,10 +98,10 @@ def sweep(
     return wanted
 
 
-def _doers(
+def _executor_of(
     plan: Plan, devices: Sequence[str], workers: int | None, scheduler: str | None
 ) -> Workers | Cluster:
-    """Who does the jobs: processes of this machine, no more than there are fits, or a cluster."""
+    """What does the jobs: processes of this machine, no more than there are fits, or a cluster."""
     if scheduler is not None:
         return Cluster(scheduler, devices[0].partition(":")[0], do)
     here = places(list(devices), workers)
@@ -107,7 +110,7 @@ def _doers(
 
 
 def _outcomes(
-    doers: Workers | Cluster, tasks: list[Task], results: dict[str, Result]
+    executor: Workers | Cluster, tasks: list[Task], results: dict[str, Result]
 ) -> Iterator[tuple[Task, Any]]:
     """Tasks with their outcomes; at once, without an attempt, where the scene was not simulated."""
     possible = []
@@ -117,7 +120,7 @@ def _outcomes(
             yield task, {**simulated, "error": f"without its scene: {simulated['error']}"}
         else:
             possible.append(task)
-    yield from doers.outcomes(possible)
+    yield from executor.outcomes(possible)
 
 
 def _result(task: Task, outcome: Any) -> Result:

@@ -19,7 +19,7 @@ from ..data.files import atomic_path
 from ..data.read import read
 from ..errors import BusyError, InputError
 from ..evaluate.compare import score
-from ..evaluate.panels import Comparison, telling_row
+from ..evaluate.panels import Comparison, row_to_show
 from ..recon.observations import data_hash
 from ..recon.settings import plain
 from ..recon.suitable import check_sequence
@@ -36,7 +36,7 @@ BUSY_S = 60.0  # [s] that a folder may be busy: a lost worker's process may stil
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A job with all that its process has to know."""
+    """A job with everything that its process needs."""
 
     job: Job
     """What to do."""
@@ -92,7 +92,7 @@ def _failure(error: Exception) -> Result:
 
 
 def _begin(place: Place) -> None:
-    """As many threads as the place has CPUs; Warp says nothing."""
+    """Use as many threads as the place has CPUs; silence Warp."""
     import cv2
 
     start_warp()
@@ -160,7 +160,7 @@ def _while_parent_lives():
 
 def _keep_picture(path: Path, comparison: Comparison) -> None:
     """Distance, truth and closed form of the frame with the most to see, as float16 [m]."""
-    s = telling_row(comparison)
+    s = row_to_show(comparison)
     images = {"d": comparison.views.d[s], "closed_form": comparison.views.closed_form[s]}
     if comparison.judgement is not None:
         images["error"] = np.sqrt(comparison.judgement.errors["d"][s])

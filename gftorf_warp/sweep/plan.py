@@ -55,7 +55,7 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """How: a row of the table."""
+    """How scenes are reconstructed: a row of the table."""
 
     preset: str
     """Name of the preset."""

@@ -81,7 +81,7 @@ def over_scenes(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
 
 
 def _why_not(plan: Plan, scene: Scene, row: Row, results: Mapping[str, Result]) -> str:
-    """In a few words why a row has no numbers; nothing if no job of it says so."""
+    """In a few words why a row has no numbers; empty if no job of it states why."""
     for seed in plan.seeds:
         result = results.get(Job(scene=scene, row=row, seed=seed).id, {})
         if "refused" in result:

@@ -90,7 +90,7 @@ class Recording:
     def _some(
         self, image: Callable[[int], Float[np.ndarray, "H W"] | None]
     ) -> list[Float[np.ndarray, "H W"]]:
-        """What a function of the raw frame knows, at a few of them."""
+        """Known values of a function of the raw frame, at a few of them."""
         chosen = np.linspace(0, self.sequence.frames - 1, SAMPLED).astype(int)
         images = [image(n) for n in sorted({*chosen.tolist()})]
         return [one for one in images if one is not None]

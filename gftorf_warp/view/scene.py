@@ -149,8 +149,8 @@ def distances_of(subject: Subject, n: int) -> dict[str, Float[np.ndarray, "H W"]
     return {title: distance for title, distance in by_title.items() if distance is not None}
 
 
-def _standing(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "H W"]]:
-    """Distances [m] of what stands in the scene, by title."""
+def _drawn_distances(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "H W"]]:
+    """Distances [m] of the shapes that are drawn, by title."""
     distances = distances_of(subject, choice.frame)
     everything = choice.beside or subject.run is None
     return {title: d for title, d in distances.items() if everything or title == OURS}
@@ -159,7 +159,7 @@ def _standing(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "
 def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
     """Points of ours if they are wanted as points, of closed form and truth beside them."""
     n, camera, drawn = choice.frame, subject.recording.camera(choice.frame), []
-    for title, distance in _standing(subject, choice).items():
+    for title, distance in _drawn_distances(subject, choice).items():
         if title == OURS and choice.shape == SPLATS:
             continue
         seen = np.isfinite(distance) & (distance > 0) & _every(distance)
@@ -176,7 +176,7 @@ def marks(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]
     """Where the chosen pixel is in every shape [m], by title; unknown distances have no mark."""
     camera, (y, x) = subject.recording.camera(choice.frame), choice.pixel
     ray = camera.rays()[y, x].numpy()
-    distances = {title: float(d[y, x]) for title, d in _standing(subject, choice).items()}
+    distances = {title: float(d[y, x]) for title, d in _drawn_distances(subject, choice).items()}
     return {
         title: camera.centre + distance * ray + _place(subject, title)
         for title, distance in distances.items()
@@ -189,7 +189,7 @@ def titles(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]
     camera, far = subject.recording.camera(0), subject.recording.distance_scale.high
     _, down, forward = camera.camera_from_world[:3, :3]
     above = camera.centre + far * (forward - 0.6 * camera.height / camera.fy * down)
-    return {title: above + _place(subject, title) for title in _standing(subject, choice)}
+    return {title: above + _place(subject, title) for title in _drawn_distances(subject, choice)}
 
 
 def _place(subject: Subject, title: str) -> Float[np.ndarray, "3"]:

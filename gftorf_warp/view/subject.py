@@ -74,7 +74,7 @@ class Subject:
         return cls(read(path), None, path)
 
     def _take(self, run: Run | None) -> None:
-        """Let a run be what is rendered."""
+        """Render this run from now on."""
         bytes_each = 4 * self.sequence.quads[0].size * (2 + self.sequence.cycle)
         self.run, self._rendered = run, Held(min(HELD, int(HELD_BYTES / bytes_each) + 1))
         self.state = None if run is None else newest(self.path)

@@ -119,7 +119,7 @@ class Window:
             self.controls.row.value, self.controls.column.value = pixel
 
     def _look_through(self) -> None:
-        """So that a click meets a pixel."""
+        """Move all viewers to the camera, where every click meets a pixel."""
         self.stage.look_through(self.subject.recording.camera(self.controls.choice.frame))
 
 

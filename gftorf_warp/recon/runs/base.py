@@ -186,7 +186,7 @@ class Run(StoredRun):
 
     @functools.cached_property
     def fallback(self) -> Fallback | None:
-        """Where the measurement knows the distance better than the Gaussians; None without that
+        """Where measured distances are more accurate than those of the Gaussians; None without that
         setting, and for a sequence that cannot be read again, which is logged.
         """
         if not self.config["settings"].get("fallback"):
@@ -235,7 +235,7 @@ class Run(StoredRun):
         yield from on_host(self.renderer(names), zip(times, cameras, strict=True), names)
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
-        """Gaussians as wide as they looked while they were optimised, for a camera that resolves
+        """Gaussians as wide as during the optimisation, for a camera that resolves
         more: :func:`gftorf_warp.recon.runs.gaussians.widened`.
         """
         return gaussians.widened(self, field, camera)

@@ -57,7 +57,7 @@ class ClosedForm(WithoutGaussians):
         )
 
     def _shown(self, time: float) -> Sequence:  # noqa: ARG002
-        """What holds the quartet that is decoded at a time [s]."""
+        """The sequence with the quartet that is decoded at a time [s]."""
         return self._measured
 
     @functools.cached_property

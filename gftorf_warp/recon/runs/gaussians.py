@@ -54,7 +54,7 @@ def replay_of(run: StoredRun, images: Collection[str], f_mod_hz: float | None) -
 
 
 def widened(run: StoredRun, field: GaussianField, camera: Camera) -> GaussianField:
-    """Gaussians as wide as they were rendered during the optimisation, for a camera that resolves
+    """Gaussians as wide as during the optimisation, for a camera that resolves
     more.
 
     The renderer's low-pass filter widens every Gaussian on the image, by ``low_pass`` at any

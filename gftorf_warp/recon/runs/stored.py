@@ -90,7 +90,7 @@ class StoredRun:
 
     @functools.cached_property
     def _held(self) -> weakref.WeakValueDictionary[str, Sequence]:
-        """The sequence, as long as anybody else holds it."""
+        """The sequence, as long as another object refers to it."""
         return weakref.WeakValueDictionary()
 
     def sequence(self) -> Sequence:
@@ -105,7 +105,7 @@ class StoredRun:
         return sequence
 
     def linked(self, sequence: str | Path) -> Self:
-        """The run with its sequence in another folder, which config.json then remembers.
+        """The run with its sequence in another folder, which is then stored in config.json.
 
         Raises:
             InputError: If the folder holds no sequence, or another one.
