@@ -1,4 +1,4 @@
-"""F-TöRF and TöRF folders, which :func:`read` accepts as well, as captures with other times."""
+"""F-TöRF and TöRF folders, which the program reads too, as captures with other times."""
 
 from __future__ import annotations
 

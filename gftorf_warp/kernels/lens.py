@@ -14,7 +14,7 @@ CLOSE = wp.constant(1.0e-7)
 
 @wp.func
 def inside(view: CameraView, x: float, y: float) -> wp.vec2:
-    """The place (x, y) [1], or, of what is outside the disc of the lens, the place on its edge."""
+    """The point (x, y) [1], or, if it is outside the disc of the lens, the point on its edge."""
     square = view.radius * view.radius
     share = wp.sqrt(square / wp.max(x * x + y * y, square))
     return wp.vec2(share * x, share * y)

@@ -65,10 +65,10 @@ def surface(
 
 
 def beside_no(
-    hidden: Bool[np.ndarray, "X Y Z"], places: Float[np.ndarray, "P 3"]
+    hidden: Bool[np.ndarray, "X Y Z"], vertices: Float[np.ndarray, "P 3"]
 ) -> Bool[np.ndarray, "P"]:
-    """Whether neither node of the edge that a vertex is on is hidden; ``places`` [voxels]."""
-    ends = (np.floor(places + ON_NODE), np.ceil(places - ON_NODE))
+    """Whether neither node of the edge that a vertex is on is hidden; ``vertices`` [voxels]."""
+    ends = (np.floor(vertices + ON_NODE), np.ceil(vertices - ON_NODE))
     largest = np.array(hidden.shape) - 1
     nodes = [tuple(np.clip(end, 0, largest).astype(int).T) for end in ends]
     return ~(hidden[nodes[0]] | hidden[nodes[1]])

@@ -165,7 +165,7 @@ def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
         seen = np.isfinite(distance) & (distance > 0) & _every(distance)
         if title == OURS and (ours := subject.ours(n)) is not None:
             seen &= ours["opacity"] >= OPAQUE
-        points = world_points(distance, camera, seen).T + _place(subject, title)
+        points = world_points(distance, camera, seen).T + _displacement(subject, title)
         rgb = cloud_colours(subject, n, choice.colour, title)[seen]
         given = {"points": points.astype(np.float32), "rgb": rgb, "pixels": np.argwhere(seen)}
         drawn.append(Cloud(title=title, **given))
@@ -178,7 +178,7 @@ def marks(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]
     ray = camera.rays()[y, x].numpy()
     distances = {title: float(d[y, x]) for title, d in _drawn_distances(subject, choice).items()}
     return {
-        title: camera.centre + distance * ray + _place(subject, title)
+        title: camera.centre + distance * ray + _displacement(subject, title)
         for title, distance in distances.items()
         if distance > 0  # NaN is not
     }
@@ -189,10 +189,12 @@ def titles(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]
     camera, far = subject.recording.camera(0), subject.recording.distance_scale.high
     _, down, forward = camera.camera_from_world[:3, :3]
     above = camera.centre + far * (forward - 0.6 * camera.height / camera.fy * down)
-    return {title: above + _place(subject, title) for title in _drawn_distances(subject, choice)}
+    return {
+        title: above + _displacement(subject, title) for title in _drawn_distances(subject, choice)
+    }
 
 
-def _place(subject: Subject, title: str) -> Float[np.ndarray, "3"]:
+def _displacement(subject: Subject, title: str) -> Float[np.ndarray, "3"]:
     """Displacement [m] of a shape, so that it stands beside ours."""
     steps = {OURS: 0, CLOSED_FORM: 0 if subject.run is None else -1, TRUTH: 1}
     right = subject.recording.camera(0).camera_from_world[0, :3]

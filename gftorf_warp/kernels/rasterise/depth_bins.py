@@ -1,6 +1,6 @@
 """Depth order of few splats without a sort: depth keys are counted into bins, compared within one.
 
-A bin is the highest bits of a key. Its first place is a sum over the bins before it; within it
+A bin is the highest bits of a key. Its first rank is a sum over the bins before it; within it
 every splat counts those in front: with a smaller key, or an equal one and a smaller index, one
 comparison in 64 bits. Culled splats have one more bin, which is not ordered.
 """
@@ -29,11 +29,11 @@ def count_bins(
     shift: int,  # lowest bits of a key, which its bin ignores [1]
     # Out:
     counts: wp.array[int],  # [COUNTS] splats of the bin before, added to
-    places: wp.array[wp.int32],  # [N] of each splat in its bin, in any order
+    offsets: wp.array[wp.int32],  # [N] of each splat in its bin, in any order
 ):
     """A thread per splat."""
     n = wp.tid()
-    places[n] = wp.atomic_add(counts, bin_of(keys[n], culled, shift) + 1, 1)
+    offsets[n] = wp.atomic_add(counts, bin_of(keys[n], culled, shift) + 1, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -43,13 +43,13 @@ def fill_bins(
     culled: int,  # key of culled splats [1]
     shift: int,  # lowest bits of a key, which its bin ignores [1]
     first: wp.array[int],  # [COUNTS] first rank of each bin
-    places: wp.array[wp.int32],  # [N] of each splat in its bin
+    offsets: wp.array[wp.int32],  # [N] of each splat in its bin
     # Out:
     members: wp.array[wp.int64],  # [N] (key << 32 | index) of every splat, bin by bin
 ):
     """A thread per splat."""
     n = wp.tid()
-    at = first[bin_of(keys[n], culled, shift)] + places[n]
+    at = first[bin_of(keys[n], culled, shift)] + offsets[n]
     members[at] = (wp.int64(keys[n]) << wp.int64(32)) | wp.int64(n)
 
 

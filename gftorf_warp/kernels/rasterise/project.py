@@ -77,7 +77,7 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
 
 @wp.func
 def veil_of(view: CameraView) -> Splat:
-    """What a Gaussian without a finite place, size or opacity becomes: NaN in every pixel.
+    """What a Gaussian without a finite position, size or opacity becomes: NaN in every pixel.
 
     Drawn as it is, it would be hidden: comparisons with NaN are false, and its box is empty.
     """

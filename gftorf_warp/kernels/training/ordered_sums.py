@@ -29,15 +29,15 @@ _ROW = f"""
     const float* in = partials.data + row * partials.shape[1];
     const int count = partials.shape[1];
 #if defined(__CUDA_ARCH__)
-    __shared__ double room[{THREADS // LANES}];
+    __shared__ double of_warps[{THREADS // LANES}];
     double s = 0.0;
     for (int i = threadIdx.x; i < count; i += {THREADS}) s += (double)in[i];
     for (int o = 16; o > 0; o >>= 1) s += __shfl_down_sync(0xffffffffu, s, o);
-    if ((threadIdx.x & 31) == 0) room[threadIdx.x / 32] = s;
+    if ((threadIdx.x & 31) == 0) of_warps[threadIdx.x / 32] = s;
     __syncthreads();
     if (threadIdx.x == 0) {{
         double total = 0.0;
-        for (int k = 0; k < {THREADS // LANES}; ++k) total += room[k];
+        for (int k = 0; k < {THREADS // LANES}; ++k) total += of_warps[k];
         out.data[row] = (float)(total * (double)scale);
     }}
 #else

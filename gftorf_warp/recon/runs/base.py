@@ -235,8 +235,8 @@ class Run(StoredRun):
         yield from on_host(self.renderer(names), zip(times, cameras, strict=True), names)
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
-        """Gaussians as wide as during the optimisation, for a camera that resolves
-        more: :func:`gftorf_warp.recon.runs.gaussians.widened`.
+        """Gaussians as wide as during the optimisation, for a camera that resolves more:
+        :func:`gftorf_warp.recon.runs.gaussians.widened`.
         """
         return gaussians.widened(self, field, camera)
 

@@ -54,8 +54,7 @@ def replay_of(run: StoredRun, images: Collection[str], f_mod_hz: float | None) -
 
 
 def widened(run: StoredRun, field: GaussianField, camera: Camera) -> GaussianField:
-    """Gaussians as wide as during the optimisation, for a camera that resolves
-    more.
+    """Gaussians as wide as during the optimisation, for a camera that resolves more.
 
     The renderer's low-pass filter widens every Gaussian on the image, by ``low_pass`` at any
     resolution. One that was fitted to smaller images would be thinner here by the difference,
