@@ -8,8 +8,8 @@ the sequence's path under OUT. A SEQUENCE named random-N that does not exist is 
 engine mesh at 96x72, 24 raw frames. `score` prints the error of d over that of the closed form on
 the same pixels, geometric means over the sequences of one parent folder, on every fifth raw frame,
 for all, moving and static pixels and for the static ones beside steps and elsewhere: of the
-fallback alone, with outlines, and with constants of recon/outlines.py or recon/phasors.py changed
-(several in one SPEC by commas).
+fallback alone, with outlines, and with constants of recon/outlines.py, recon/phasors.py or
+recon/straight.py changed (several in one SPEC by commas).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from gftorf_warp.data.steps import near_steps
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
-from gftorf_warp.recon import outlines, phasors
+from gftorf_warp.recon import outlines, phasors, straight
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.sim.random_scene import random_scene
 
 SIZE, FRAMES = (96, 72), 24  # of simulated scenes
 FIRST, EVERY = 2, 5  # [raw frames] scored ones: their slots differ
-MODULES = {"outlines": outlines, "phasors": phasors}
+MODULES = {"outlines": outlines, "phasors": phasors, "straight": straight}
 Stored = dict[str, Any]
 
 

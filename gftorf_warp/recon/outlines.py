@@ -10,11 +10,12 @@ phases psi of both and the share s of the pixel's area that the first one covers
 The ray through the centre meets the first one if s > 1/2, for a straight outline. The surface
 behind goes on behind the other one: its amplitude is that of its neighbour, within some 20 %. The
 one in front may turn away at its outline, or show a narrow side there: its amplitude is
-extrapolated from two neighbours, and known half as well. So every share has a likelihood, and the
-distance is the mean of both surfaces' distances, weighted by the odds that the centre is on them.
-Pairs of neighbours in four directions vote with their likelihoods, against a surface of the pixel's
-own, of which any phasor is as likely: its distance is the rendered one. The phasor is not only
-rendered, see phasors.py.
+extrapolated from two neighbours, times a gain that is unknown but goes on along the outline, as
+its position does, see straight.py. So every share has a likelihood, and the distance is the mean of
+both surfaces' distances, weighted by the odds that the centre is on them. Pairs of neighbours in
+four directions vote with their likelihoods, against a surface of the pixel's own, of which any
+phasor is as likely: its distance is the rendered one. The phasor is not only rendered, see
+phasors.py.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from ..data.steps import STEP_M
 from ..render.api import Rendering
 from ..scene.sensor import Sensor
 from .phasors import Phasor, rendered_phasor
+from .straight import Outline, along_outline
 
 OUTLINE = 3  # in a map of sources, see fallback.py
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns)
@@ -38,9 +40,12 @@ PASSES = 2  # the second one sees neighbours that are no mixtures any more
 SHARES = 21  # of the area of a pixel, from 0 to 1
 BLUR = 0.08  # [pixels] outlines are not straight: how sure the share makes of the centre
 SMOOTH = 0.25  # [steps] distances of two neighbours on one side differ by less
-FRONT_SPREAD = 0.4  # [1] standard deviation of an extrapolated amplitude, relative: a side face
+GAINS = (0.6, 1.0, 1.4)  # [1] of an extrapolated amplitude all along an outline: a side face
+GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
+FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
 BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
 EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
+ANY = 1.0 / math.pi  # density of any phasor in a unit disc
 LEAST = 1e-12  # [quad units] below it a neighbour is black
 MARGIN = 3  # [pixels] to the farthest neighbour
 
@@ -92,16 +97,20 @@ def _resolved(
     """One pass over the pixels ``where`` a distance may change."""
     amplitude = phasor.value.abs().clamp_min(LEAST)
     nearby = torch.nn.functional.max_pool2d(amplitude[None], 3, stride=1, padding=1)[0]
-    total = torch.full_like(distance, 1.0 / math.pi)  # density of any phasor in a unit disc
+    total = torch.full_like(distance, ANY)
     weighted = total * distance
     beyond, light = _padded(distance), _padded(torch.log(amplitude))
+    chances = torch.tensor(GAIN_CHANCES, device=distance.device)
     on_first = torch.special.ndtr((_shares(distance.device) - 0.5) / BLUR)
     for direction in DIRECTIONS:
         before, after = (-direction[0], -direction[1]), direction
         mixed = where & _between_two_surfaces(beyond, before, after)
         pixels = torch.nonzero(mixed, as_tuple=True)
         first, second = _sides(beyond, light, pixels, (before, after))
-        likelihood = _likelihood(phasor, pixels, nearby[pixels], (first, second), sensor) / SHARES
+        unit, of_gains = nearby[pixels], [_with_gain(first, second, gain) for gain in GAINS]
+        alone = [_likelihood(phasor, pixels, unit, sides, sensor) for sides in of_gains]
+        outline = Outline(after, pixels, first.distance, second.distance, distance, SMOOTH)
+        likelihood = along_outline(torch.stack(alone) / SHARES, chances, ANY, outline)
         odds = (likelihood * on_first[:, None]).sum(dim=0)
         both = likelihood.sum(dim=0)
         mean = odds * first.distance + (both - odds) * second.distance
@@ -160,6 +169,16 @@ def _sides(
         spreads.append(torch.full_like(once, BACK_SPREAD).masked_fill(in_front, FRONT_SPREAD))
     first, second = (_brought_near(distance, pixels, direction) for direction in towards)
     return _Side(first, amplitudes[0], spreads[0]), _Side(second, amplitudes[1], spreads[1])
+
+
+def _with_gain(first: _Side, second: _Side, gain: float) -> tuple[_Side, _Side]:
+    """Both sides, the amplitude of the one in front times the gain."""
+    first_gain = torch.where(first.distance < second.distance, gain, 1.0)
+    second_gain = torch.where(first.distance < second.distance, 1.0, gain)
+    return (
+        first._replace(amplitude=first.amplitude * first_gain),
+        second._replace(amplitude=second.amplitude * second_gain),
+    )
 
 
 def _brought_near(
