@@ -29,7 +29,7 @@ from .observations import Observations
 from .settings import ReconSettings
 from .terms import Term, View
 
-ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``Comparison.rows``
+ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``BatchImage.rows``
 NUMBERS = len(ROWS) + 2  # integers of an image: its rows, seed and number of its random background
 FLOWS = 2  # of a quartet: to the next one and to the previous one
 

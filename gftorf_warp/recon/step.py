@@ -26,7 +26,7 @@ from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
 from .renderings import Renderer, primary
 from .settings import ReconSettings
-from .terms import Comparison, Term
+from .terms import BatchImage, Term
 
 Map = Callable[[Callable[[int], "ImageGradients"], Iterable[int]], Iterable["ImageGradients"]]
 
@@ -156,7 +156,7 @@ class Step:
             offset, rotation = key_motion
             leaf = KeyMotion(_leaf_of(offset), None if rotation is None else _leaf_of(rotation))
         renderings, moved = self.renderer.render(n, image, field, leaf, control, render)
-        comparison = Comparison(
+        batch_image = BatchImage(
             observations=self.observations,
             settings=self.settings,
             renderings=renderings,
@@ -168,7 +168,7 @@ class Step:
             scratch=lambda name: self._scratch[n, name],
         )
         leaves = [*values.values(), *(t for t in leaf or () if t is not None)]
-        gradients = self._gradients(n, image, comparison, leaves)
+        gradients = self._gradients(n, image, batch_image, leaves)
         based_on = renderings.get(primary(image))
         return ImageGradients(
             values=gradients[: len(values)],
@@ -178,7 +178,7 @@ class Step:
         )
 
     def _gradients(
-        self, n: int, image: ImageKey, comparison: Comparison, leaves: list[Tensor]
+        self, n: int, image: ImageKey, batch_image: BatchImage, leaves: list[Tensor]
     ) -> list[Tensor | None]:
         """Gradients of the weighted terms of one image; the results of the terms are stored."""
         values, weights = [], []
@@ -186,7 +186,7 @@ class Step:
         for k, term in enumerate(self.terms):
             if term.name not in image.terms:
                 continue
-            value = term.loss(comparison, results[n, k])
+            value = term.loss(batch_image, results[n, k])
             if value.data_ptr() != results[n, k].data_ptr():
                 # .data: other rows are part of a graph by now
                 results.data[n, k, 0] = value.detach()

@@ -39,7 +39,7 @@ class View(enum.Enum):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Comparison:
+class BatchImage:
     """One image of a batch: its renderings, and where on the device its measured images are."""
 
     observations: Observations
@@ -74,7 +74,7 @@ class Term:
 
     name: str
     """Key in metrics.jsonl."""
-    loss: Callable[[Comparison, Tensor], Tensor]
+    loss: Callable[[BatchImage, Tensor], Tensor]
     """The unweighted term [0-d] of one image. The second argument [3] is device memory for the
     term, its mean squared difference and the mean opacity times channels, which kernels may fill
     themselves; a term that does not is copied there."""
@@ -94,7 +94,7 @@ class Term:
     only."""
 
 
-def light_loss(image: Comparison, out: Tensor) -> Tensor:
+def light_loss(image: BatchImage, out: Tensor) -> Tensor:
     """Quad or phasor: (1 - ssim) L2 + ssim (1 - SSIM).
     The amplitude of a phasor is not compared.
     """
@@ -104,7 +104,7 @@ def light_loss(image: Comparison, out: Tensor) -> Tensor:
     return _image_loss(image, LIGHT, tof.quads, measured.quads[:, None], tof.opacity, out)
 
 
-def colour_loss(image: Comparison, out: Tensor) -> Tensor:
+def colour_loss(image: BatchImage, out: Tensor) -> Tensor:
     """Colour: (1 - ssim) L1 or L2 + ssim (1 - SSIM)."""
     seen, norm = image.renderings[View.COLOUR], image.settings.weights.colour_norm
     measured = image.observations.colour.images
@@ -112,25 +112,25 @@ def colour_loss(image: Comparison, out: Tensor) -> Tensor:
     return _image_loss(image, "colour", seen.colour, measured, seen.opacity, out, norm)
 
 
-def depth_loss(image: Comparison, out: Tensor) -> Tensor:
+def depth_loss(image: BatchImage, out: Tensor) -> Tensor:
     """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM)."""
     distance = image.renderings[View.TOF].distance[None]
     measured = image.observations.closed_form.images
     return _image_loss(image, "depth", distance, measured, None, out, Norm.L1)
 
 
-def distortion_loss(image: Comparison, _out: Tensor) -> Tensor:
+def distortion_loss(image: BatchImage, _out: Tensor) -> Tensor:
     """Mean depth distortion [m^2]."""
     return image.renderings[View.TOF].distortion.mean()
 
 
-def motion_size_loss(image: Comparison, _out: Tensor) -> Tensor:
+def motion_size_loss(image: BatchImage, _out: Tensor) -> Tensor:
     """Mean length of the displacements [m]."""
     assert image.displacement is not None
     return (motion_size(image.displacement) * image.mean_weight).sum()
 
 
-def flow_loss(image: Comparison, out: Tensor) -> Tensor:
+def flow_loss(image: BatchImage, out: Tensor) -> Tensor:
     """Squared difference of rendered and measured flow [px^2], forward plus backward.
 
     The mean is over all pixels and both components; unknown ones count zero. Gradients reach only
@@ -146,7 +146,7 @@ def flow_loss(image: Comparison, out: Tensor) -> Tensor:
 
 
 def _image_loss(
-    image: Comparison,
+    image: BatchImage,
     name: str,
     rendered: Tensor,
     measured: Tensor,
