@@ -55,7 +55,7 @@ def test_phasor_and_quad_input_agree_on_a_static_scene(tmp_path):
     one = recording(frames=12)[0]
     still = replace(one, quads=np.tile(one.quads[:4], (3, 1, 1)), flow=Flow())
     distances = []
-    for kind, images in ((Input.QUADS, 480), (Input.PHASOR, 120)):
+    for kind, images in ((Input.QUADS, 160), (Input.PHASOR, 40)):
         run = reconstruct(still, tmp_path / kind, replace(demo(input=kind, images=images)))
         assert run.config["input"] == kind
         distances.append(run.render(5 / 120).distance)
