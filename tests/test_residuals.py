@@ -201,7 +201,7 @@ def test_flow_of_the_wrong_sign_shows_as_wrong_motion(tmp_path):
         backward={n: -flow for n, flow in measured.flow.backward.items()},
     )
     for flow, wrong in ((measured.flow, False), (turned, True)):
-        run = reconstruct(replace(measured, flow=flow), tmp_path / str(wrong), demo(images=600))
+        run = reconstruct(replace(measured, flow=flow), tmp_path / str(wrong), demo(images=400))
         found = checked.problems(run.config["explained"])
         assert any("motion is missing or wrong" in text for text in found) == wrong
 
