@@ -7,13 +7,13 @@ import signal
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from moving_box import recording
+from sweep_work import Unloadable, die_once, pid, sleep
 
 from gftorf_warp.cli import main
 from gftorf_warp.data.lock import locked
@@ -227,38 +227,6 @@ def test_a_wrong_plan_is_a_named_error(tmp_path, text):
     (tmp_path / "plan.toml").write_text(text)
     with pytest.raises(InputError, match="(?s)plan.toml.*" + WRONG[text]):
         read_plan(tmp_path / "plan.toml")
-
-
-def die_once(task, place):
-    """Kill the own process the first time."""
-    path, times = task
-    count = len(list(Path(path).iterdir()))
-    (Path(path) / str(count)).touch()
-    if count < times:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return count, place.device
-
-
-def sleep(task, place):  # noqa: ARG001
-    """A job that takes so many seconds."""
-    time.sleep(task)
-
-
-def pid(task, place):  # noqa: ARG001
-    """Which process does the work."""
-    return os.getpid()
-
-
-def cannot_load():
-    """What the loader says without memory."""
-    raise ImportError("libtorch: failed to map segment")
-
-
-class Unloadable:
-    """Work that no process can load."""
-
-    def __reduce__(self):
-        return cannot_load, ()
 
 
 @pytest.mark.parametrize(("deaths", "outcome"), [(1, (1, "cpu")), (9, None)])
