@@ -18,7 +18,7 @@ import pytest
 
 DESKTOP = (1280, 900)  # [px] width and height of a window
 PHONE = (390, 844)
-PATIENCE_S = 60.0  # [s] after which a browser that does not answer is a failure
+PATIENCE_S = 180.0  # [s] after which a browser that does not answer is a failure
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking",

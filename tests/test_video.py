@@ -99,13 +99,11 @@ def test_a_video_shows_every_time(run, tmp_path, capfd, suffix):
 
 PLAYER = """<video src="data:video/{kind};base64,{data}" muted></video><script>
 const video = document.querySelector("video"), sketch = document.createElement("canvas");
-async function colourAt(time) {{
-  const shown = new Promise(done => video.addEventListener("seeked", done, {{once: true}}));
-  video.currentTime = time;
-  await shown;
+function shows(colour) {{
   const pen = sketch.getContext("2d");
   pen.drawImage(video, 0, 0);
-  return Array.from(pen.getImageData(20, 20, 1, 1).data.slice(0, 3));
+  const data = pen.getImageData(20, 20, 1, 1).data;
+  return colour.every((value, k) => Math.abs(value - data[k]) < 40);
 }}
 </script>"""
 
@@ -126,9 +124,9 @@ def test_a_video_plays_in_a_browser(tmp_path, kind):
         assert tab.value("[video.videoWidth, video.videoHeight]") == [64, 48]
         assert tab.value("video.duration") == pytest.approx(0.75, abs=0.02)
         for k, colour in enumerate(colours):
-            found = tab.value(f"colourAt({(k + 0.5) / 4})")
+            tab.value(f"video.currentTime = {(k + 0.5) / 4}")
             # OpenCV states no matrix for its YUV, and Chromium takes another one: 27 away here
-            assert np.abs(np.array(found) - colour).max() < 40, (k, found)
+            tab.until(f"shows({colour.tolist()})")  # "seeked" may come before the picture
         tab.value("video.play()")
         tab.until("video.ended")
         assert tab.problems == []
