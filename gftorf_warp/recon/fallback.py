@@ -78,12 +78,12 @@ class Fallback:
 
     @classmethod
     def of(
-        cls, found: Residuals | None, sequence: Sequence, camera: Camera, device: torch.device
+        cls, residuals: Residuals | None, sequence: Sequence, camera: Camera, device: torch.device
     ) -> Fallback | None:
         """Judge a run by its residuals.
 
         Args:
-            found: Residuals of the run; None where nothing was fitted to quads.
+            residuals: Residuals of the run; None where nothing was fitted to quads.
             sequence: What was measured.
             camera: The camera of raw frame 0, at the size of the sequence.
             device: Where images are rendered.
@@ -92,10 +92,10 @@ class Fallback:
             None without residuals.
         """
         noise = quad_noise(sequence)
-        if found is None or noise is None:
+        if residuals is None or noise is None:
             return None
-        explained = _enlarged(~found.unexplained, sequence)
-        chi_square = _enlarged(found.chi_square, sequence)
+        explained = _enlarged(~residuals.unexplained, sequence)
+        chi_square = _enlarged(residuals.chi_square, sequence)
         agrees = temporal.agreement(sequence)
         averaged, count = temporal.averaged_or_locally(sequence)
         quartets = sequence.complete_quartets
@@ -103,18 +103,18 @@ class Fallback:
         of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
-        odds = _odds(found.changing_unexplained_share, found)
+        odds = _odds(residuals.changing_unexplained_share, residuals)
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
         if temporal.camera_rests(sequence) or sequence.from_phasors:
             needed = np.where(_supported(alone), odds, odds**2)
-            needed = np.where(_is_useless(found, sequence, noise), 0.0, needed)
+            needed = np.where(_is_useless(residuals, sequence, noise), 0.0, needed)
             moved = ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
             moved &= ~agrees & (count == 1)
         else:  # a chi-square that is not finite is none
             moved = (of_phasor <= CHI_SQUARE_MAX) | ~(chi_square < of_phasor)
-        stays = math.sqrt(2.0 * math.log(_odds(found.contradicted_share, found)))
+        stays = math.sqrt(2.0 * math.log(_odds(residuals.contradicted_share, residuals)))
 
         def tensor(image: np.ndarray) -> Tensor:
             kind = torch.bool if image.dtype == bool else torch.float32
@@ -157,17 +157,17 @@ class Fallback:
         return replace(rendering, distance=distance, opacity=opacity, source=source)
 
 
-def _odds(wrong: float | None, found: Residuals) -> float:
+def _odds(wrong: float | None, residuals: Residuals) -> float:
     """Odds [1] that the fit is right, from a share of pixels where it is wrong; None: of all."""
-    wrong = found.unexplained_share if wrong is None else wrong
+    wrong = residuals.unexplained_share if wrong is None else wrong
     low, high = ODDS
     return min(max((1.0 - wrong) / max(wrong, 1.0 / high), low), high)
 
 
-def _is_useless(found: Residuals, sequence: Sequence, noise: QuadNoise) -> bool:
+def _is_useless(residuals: Residuals, sequence: Sequence, noise: QuadNoise) -> bool:
     """Whether a fit explains the quads no better than black images do: it failed as a whole."""
     black = _chi_square(sequence, np.zeros_like(temporal.stacked_quads(sequence)), noise)
-    return not found.chi_square.mean(dtype=float) < (1.0 - NEAR) * black.mean(dtype=float)
+    return not residuals.chi_square.mean(dtype=float) < (1.0 - NEAR) * black.mean(dtype=float)
 
 
 def _between(

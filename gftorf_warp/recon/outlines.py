@@ -74,10 +74,10 @@ def resolved(rendering: Rendering, sensor: Sensor, phasor: Phasor | None = None)
 
 def at_outlines(distance: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Pixels between two surfaces, in any of the four directions."""
-    padded, found = _padded(distance), torch.zeros_like(distance, dtype=torch.bool)
+    padded, outline_pixels = _padded(distance), torch.zeros_like(distance, dtype=torch.bool)
     for rows, columns in DIRECTIONS:
-        found |= _between_two_surfaces(padded, (-rows, -columns), (rows, columns))
-    return found
+        outline_pixels |= _between_two_surfaces(padded, (-rows, -columns), (rows, columns))
+    return outline_pixels
 
 
 class _Side(NamedTuple):
@@ -130,11 +130,11 @@ def _between_two_surfaces(
     own at nearly the same distance.
     """
     jump = (_neighbour(distance, before) - _neighbour(distance, after)).abs()
-    found = jump > STEP_M
+    between = jump > STEP_M
     for towards in (before, after):
         beside = _neighbour(distance, towards) - _neighbour(distance, towards, 2)
-        found &= beside.abs() < SMOOTH * jump
-    return found
+        between &= beside.abs() < SMOOTH * jump
+    return between
 
 
 def _padded(image: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:

@@ -46,10 +46,10 @@ class Inputs:
         Raises:
             ValueError: If names or lengths are not those that were allocated.
         """
-        found = {name: len(values) for name, values in numbers.items()}
+        lengths = {name: len(values) for name, values in numbers.items()}
         wanted = {name: len(memory) for name, memory in self.given.items()}
-        if found != wanted:
-            raise ValueError(f"numbers of one key have the lengths {wanted}, got {found}")
+        if lengths != wanted:
+            raise ValueError(f"numbers of one key have the lengths {wanted}, got {lengths}")
         self._upload.send(*(numbers[name] for name in self.given))
 
 

@@ -124,5 +124,5 @@ def median_distance(samples: Samples, transmittance: Float[Tensor, "R S"]) -> Fl
     """
     behind = transmittance * (1.0 - samples.alpha)
     first = torch.argmax((behind < 0.5).to(torch.uint8), dim=-1, keepdim=True)
-    found = torch.gather(samples.distance, 1, first)
-    return torch.where(torch.gather(behind, 1, first) < 0.5, found, torch.zeros_like(found))[:, 0]
+    there = torch.gather(samples.distance, 1, first)
+    return torch.where(torch.gather(behind, 1, first) < 0.5, there, torch.zeros_like(there))[:, 0]

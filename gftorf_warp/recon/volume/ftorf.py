@@ -176,8 +176,8 @@ class Ftorf(Volume):
             torch.cat(moved), given["visited"], slice(count), slice(count, None)
         )
         gaps = [
-            (flow + found[..., returns, :]).abs().mean()
-            for (flow, returns), found in zip(ways, back, strict=True)
+            (flow + returned[..., returns, :]).abs().mean()
+            for (flow, returns), returned in zip(ways, back, strict=True)
         ]
         return beside, torch.stack(gaps).sum() if gaps else points.new_zeros(())
 
@@ -208,6 +208,6 @@ def _errors(
     sensor = targets.observations.sensor
     passed = samples.transmittance
     shift, slope = (given[name][:, None, None] for name in ("shift", "slope"))
-    found = composite.modulated(samples, sensor, passed, shift, slope)
+    rendered = composite.modulated(samples, sensor, passed, shift, slope)
     measured = targets.quads[given["frames"][:, None], pixels]
-    return (found - measured).square().mean(dim=1)
+    return (rendered - measured).square().mean(dim=1)

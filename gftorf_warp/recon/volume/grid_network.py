@@ -136,13 +136,13 @@ class GridNetwork(torch.nn.Module):
         """Light of samples of rays in directions of length 1."""
         known = encoded(direction, self.direction_powers, columns=self.columns)
         seen = functional.relu(self.seen(trunk) + self.seen_from(known)[:, None])
-        found = self.light_head(seen).float()
-        return Light(functional.softplus(found[..., 0]), torch.sigmoid(found[..., 1:]))
+        light = self.light_head(seen).float()
+        return Light(functional.softplus(light[..., 0]), torch.sigmoid(light[..., 1:]))
 
     def flow(
         self, points: Float[Tensor, "T P 3"], times: Int[Tensor, "T"], reach: float
     ) -> Float[Tensor, "T P 2 3"]:
         """Displacement to the next quartet and to the one before [m], at most ``reach`` each."""
         hidden = functional.relu(self.flow_hidden(self.flowing(points, times)))
-        found = reach * torch.tanh(self.flow_rate * self.flow_head(hidden).float())
-        return found.unflatten(-1, (2, 3))
+        flow = reach * torch.tanh(self.flow_rate * self.flow_head(hidden).float())
+        return flow.unflatten(-1, (2, 3))

@@ -118,8 +118,8 @@ class GridVolume(Ftorf):
         network: Field | None = None,
     ) -> Samples:
         """What the grids put on rays."""
-        found = self.field if network is None else network
-        return super().samples(trunk, rays, depths, draw=draw, colour=colour, network=found)
+        network_used = self.field if network is None else network
+        return super().samples(trunk, rays, depths, draw=draw, colour=colour, network=network_used)
 
     def more_terms(
         self,

@@ -115,8 +115,8 @@ class VolumeLoop:
         state = self.state
         sums = [state.sums[name] for name in state.counts]
         values = torch.stack(sums).tolist()  # one transfer
-        found = zip(state.counts.items(), values, strict=True)
-        means = {name: value / count for (name, count), value in found}
+        counted = zip(state.counts.items(), values, strict=True)
+        means = {name: value / count for (name, count), value in counted}
         torch._foreach_zero_(sums)
         state.counts.clear()
         if not math.isfinite(means["loss"]):

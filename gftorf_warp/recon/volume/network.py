@@ -102,10 +102,10 @@ class VolumeNetwork(torch.nn.Module):
         known = encoded(points, self.position_powers, columns=self._columns)
         values = functional.relu(self._joined("0", known, codes))
         for name, layer in self.hidden.items():
-            found = layer(values)
+            product = layer(values)
             if name in self.entry:
-                found = found + self._joined(name, known, codes)
-            values = functional.relu(found)
+                product = product + self._joined(name, known, codes)
+            values = functional.relu(product)
         return values
 
     def _joined(
@@ -123,8 +123,8 @@ class VolumeNetwork(torch.nn.Module):
         """Light of samples of rays in directions of length 1."""
         seen_from = self.seen_from(encoded(direction, self.direction_powers))
         seen = functional.relu(self.seen(self.bottleneck(trunk)) + seen_from[:, None])
-        found = self.light_head(seen).float()
-        return Light(found[..., 0].abs(), torch.sigmoid(found[..., 1:]))
+        light = self.light_head(seen).float()
+        return Light(light[..., 0].abs(), torch.sigmoid(light[..., 1:]))
 
     def blend(self, trunk: Float[Tensor, "*n w"]) -> Float[Tensor, "*n"]:
         """Share of what moves [1]."""
@@ -132,8 +132,8 @@ class VolumeNetwork(torch.nn.Module):
 
     def flow(self, trunk: Float[Tensor, "*n w"], reach: float) -> Float[Tensor, "*n 2 3"]:
         """Displacement to the next quartet and to the one before [m], at most ``reach`` each."""
-        found = reach * torch.tanh(self.flow_head(trunk).float())
-        return found.unflatten(-1, (2, 3))
+        flow = reach * torch.tanh(self.flow_head(trunk).float())
+        return flow.unflatten(-1, (2, 3))
 
 
 @torch.no_grad()

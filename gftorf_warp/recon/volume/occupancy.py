@@ -86,13 +86,13 @@ class Occupancy(torch.nn.Module):
         wanted = torch.linspace(0.0, samples - 1.0, samples, device=mass.device) + offset
         last = edges[:, -1:]  # 1 but for rounding
         wanted = (wanted / samples * last).expand(rays, samples).contiguous()
-        found = torch.searchsorted(edges, wanted, right=True).sub_(1).clamp_(0, count - 1)
-        here = share.gather(1, found).clamp_min(1e-12)
+        cell = torch.searchsorted(edges, wanted, right=True).sub_(1).clamp_(0, count - 1)
+        here = share.gather(1, cell).clamp_min(1e-12)
         step = (bounds[1] - bounds[0]) / count
-        within = ((wanted - edges.gather(1, found)) / here).clamp(0.0, 1.0)
+        within = ((wanted - edges.gather(1, cell)) / here).clamp(0.0, 1.0)
         interval = step / (samples * here)
         interval[:, -1].fill_(CLOSED)
-        return Depths(z=bounds[0] + step * (found + within), interval=interval)
+        return Depths(z=bounds[0] + step * (cell + within), interval=interval)
 
     def _cells(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Numbers of the cells of points in the unit cube."""

@@ -84,12 +84,13 @@ class Views:
         """Largest |x / z| and |y / z| of the points of all rays between two z-depths [m]."""
         ends = torch.tensor(bounds, device=self._local.device).expand(self.pixels, 2)
         poses = torch.unique(self._volume_from_camera, dim=0)
-        found = []
+        extents = []
         for pose in poses:
             direction = self._local @ pose[:3, :3].T
             at = pose[:3, 3] + ends[..., None] * direction[:, None]
-            found.append((at[..., :2] / at[..., 2:].clamp_min(0.5 * bounds[0])).abs().amax((0, 1)))
-        x, y = torch.stack(found).amax(0).tolist()
+            ratio = at[..., :2] / at[..., 2:].clamp_min(0.5 * bounds[0])
+            extents.append(ratio.abs().amax((0, 1)))
+        x, y = torch.stack(extents).amax(0).tolist()
         return x, y
 
     def rays(self, view: Int[Tensor, "1"] | int, pixels: Int[Tensor, "R"] | None = None) -> Rays:

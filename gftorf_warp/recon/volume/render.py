@@ -51,12 +51,12 @@ def rendering_of(
     images = {
         name: torch.cat([row[name] for row in rows], dim=-1).unflatten(-1, size) for name in rows[0]
     }
-    found = Rendering(**{"colour": None} | images, extra=None, screen=None)
+    rendering = Rendering(**{"colour": None} | images, extra=None, screen=None)
     return replace(
-        found,
-        quads=found.quads / quad_scale,
-        phasor=found.phasor / quad_scale,
-        colour=None if found.colour is None else found.colour / colour_scale,
+        rendering,
+        quads=rendering.quads / quad_scale,
+        phasor=rendering.phasor / quad_scale,
+        colour=None if rendering.colour is None else rendering.colour / colour_scale,
     )
 
 

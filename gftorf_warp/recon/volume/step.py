@@ -102,15 +102,15 @@ class VolumeStep:
 
     def _add_to_parameters(self, gradients: tuple[Tensor | None, ...]) -> None:
         """Accumulate gradients; a parameter that never had one keeps None, and Adam leaves it."""
-        sums, found = [], []
+        sums, added = [], []
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             if gradient is None:
                 continue
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
             sums.append(parameter.grad)
-            found.append(gradient)
-        torch._foreach_add_(sums, found)
+            added.append(gradient)
+        torch._foreach_add_(sums, added)
 
 
 def graph_of(state: VolumeState, pool: object) -> CapturedGraph:

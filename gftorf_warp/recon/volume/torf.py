@@ -80,8 +80,8 @@ class Torf(Volume):
         rays = targets.views.rays(given["view"], pixels)
         samples = self._drawn(rays, given["quartet"], draw)
         sensor, passed = targets.observations.sensor, samples.transmittance
-        found = composite.phasor(samples, sensor, passed, given["slope"])[:2]
-        return torch.mean((found - picked(targets.phasors, given["row"], pixels)).square())
+        rendered = composite.phasor(samples, sensor, passed, given["slope"])[:2]
+        return torch.mean((rendered - picked(targets.phasors, given["row"], pixels)).square())
 
     def _colour(self, targets: Targets, given: Given, draw: Draw) -> Tensor:
         """Mean squared error of the colour [1]."""
@@ -90,8 +90,8 @@ class Torf(Volume):
         pixels = draw.pixels(self.settings.rays, targets.colour_views.pixels)
         rays = targets.colour_views.rays(given["view"], pixels)
         samples = self._drawn(rays, given["quartet"], draw, colour=True)
-        found = composite.colour(samples, samples.transmittance)
-        return torch.mean((found - picked(targets.colour, given["row"], pixels)).square())
+        rendered = composite.colour(samples, samples.transmittance)
+        return torch.mean((rendered - picked(targets.colour, given["row"], pixels)).square())
 
     def _drawn(
         self, rays: Rays, quartet: Int[Tensor, "1"], draw: Draw, *, colour: bool = False
