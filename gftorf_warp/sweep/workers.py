@@ -23,6 +23,7 @@ from typing import Any
 
 GRACE_S = 40.0  # [s] after the deadline, or after a signal to end
 TRIES = 3
+FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,11 @@ class Workers:
         self._free = list(places)[::-1]
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, Any, int]] = {}
-        self._context = multiprocessing.get_context("spawn")  # CUDA does not survive a fork
+        # forks of one process that has imported what the work needs and knows no CUDA, which would
+        # not survive a fork; "spawn" imports it again in every process
+        self._context = multiprocessing.get_context("forkserver" if FORKS else "spawn")
+        if FORKS:
+            self._context.set_forkserver_preload([work.__module__])
 
     def __enter__(self) -> Workers:
         return self
