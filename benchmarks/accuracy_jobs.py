@@ -26,7 +26,7 @@ import torch
 import warp as wp
 
 from gftorf_warp import Sequence, compare, reconstruct, simulate
-from gftorf_warp.data.decode import closed_form_distance, unambiguous_range
+from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.flow import compute_flow
 from gftorf_warp.data.read import read, read_truth
 from gftorf_warp.data.texts import read_rows
@@ -179,8 +179,7 @@ class Fits:
 def settings_of(sequence: Sequence, row: Row, images: int | None) -> ReconSettings:
     """The settings of a row for a sequence: its preset, shortened to ``images``, then changed."""
     kind = input_of(sequence, Input.AUTO)
-    recorded = presets.Recorded(input=kind, unambiguous_range=unambiguous_range(sequence))
-    settings = presets.preset(row.preset, recorded)
+    settings = presets.preset(row.preset, presets.Recorded.of(sequence, kind))
     if images is not None and settings.method == Method.GAUSSIANS:
         settings = presets.shortened(settings, images)
     schedule = replace(settings.schedule, checkpoint_every_s=1e9)

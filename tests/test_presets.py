@@ -368,3 +368,9 @@ def _leaves(one, other, prefix=""):
             yield from _leaves(a, b, f"{prefix}{field.name}.")
         else:
             yield f"{prefix}{field.name}", a, b
+
+
+def test_best_compares_wide_raw_frames_more_often():
+    """One image is one raw frame or quartet: more pixels, more images, up to ``width_max``."""
+    images = [presets.best(Recorded(width=width)).schedule.images for width in (96, 160, 161, 640)]
+    assert images == [4000, 4000, 8000, 8000]

@@ -80,7 +80,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         weights=Weights(
             ssim=0.2, distortion=3e-3, colour=1.0 if recorded.input == Input.PHASOR else 0.0
         ),
-        schedule=Schedule(images=4000, batch=Batch.QUARTET),
+        schedule=Schedule(images=4000 if recorded.width <= 160 else 8000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
         scale_max=0.05 * recorded.scene_scale,  # where the paper prunes (section 6.6)
         background=0.3,

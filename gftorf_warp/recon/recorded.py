@@ -20,6 +20,8 @@ class Recorded:
     """Distances are known modulo this [m]."""
     camera_moves: bool = False
     """Whether raw frames have different poses."""
+    width: int = 160
+    """Columns of a raw frame."""
 
     @classmethod
     def of(cls, sequence: Sequence, wanted: Input) -> Recorded:
@@ -28,6 +30,7 @@ class Recorded:
             input=wanted,
             unambiguous_range=unambiguous_range(sequence),
             camera_moves=not camera_rests(sequence),
+            width=sequence.width,
         )
 
     @property

@@ -93,7 +93,7 @@ def reconstruct(
 
     >>> from gftorf_warp import reconstruct, simulate
     >>> recording = simulate("demo", "demo", frames=8, size=(24, 18))
-    >>> run = reconstruct(recording, "run", images=8)  # 4,000 is the default
+    >>> run = reconstruct(recording, "run", images=8)  # 4,000 is the default here
     >>> run.render(time=0.0123).distance.shape
     torch.Size([18, 24])
     """

@@ -19,7 +19,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # no fork server on Windows
+    from multiprocessing.context import ForkServerContext, SpawnContext
 
 GRACE_S = 40.0  # [s] after the deadline, or after a signal to end
 TRIES = 3
@@ -84,8 +87,9 @@ class Workers:
         self._busy: dict[Connection, tuple[_Worker, Any, int]] = {}
         # forks of one process that has imported what the work needs and knows no CUDA, which would
         # not survive a fork; "spawn" imports it again in every process
-        self._context = multiprocessing.get_context("forkserver" if FORKS else "spawn")
+        self._context: ForkServerContext | SpawnContext = multiprocessing.get_context("spawn")
         if FORKS:
+            self._context = multiprocessing.get_context("forkserver")
             self._context.set_forkserver_preload([work.__module__])
 
     def __enter__(self) -> Workers:
