@@ -71,6 +71,7 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/tensor_cores.py": "layers of a network: tensors of torch, kernels of Warp",
 }
 LAUNCHES = {  # file: what it launches
+    "render/runtime.py": "whatever the files below do, the first of a kernel alone",
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
     "render/side_by_side.py": "its launches over ranges of tiles",

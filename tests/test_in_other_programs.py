@@ -168,6 +168,26 @@ def test_threads_of_a_new_process_render_at_the_same_time_and_print_nothing():
     assert done.stdout == ""
 
 
+def test_cpu_threads_render_at_the_same_time():
+    """The lock is for the first launch of a kernel: the images of a batch have a thread each."""
+
+    def step():
+        field = CASE.field.map(lambda tensor: tensor.clone().requires_grad_())
+        api.rasterize(
+            field, CASE.camera, CASE.sensor, CASE.settings
+        ).quads.square().sum().backward()
+        steps.append(field.mean.grad)
+
+    steps: list[torch.Tensor] = []
+    step()
+    with runtime.LAUNCHING:
+        other = threading.Thread(target=step, daemon=True)
+        other.start()
+        other.join(LONG_S)
+        assert not other.is_alive()
+    assert_close(*steps)
+
+
 @pytest.mark.parametrize("value", NOT_FINITE)
 @pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
 def test_a_camera_refuses_intrinsics_that_are_not_finite(name, value):

@@ -29,16 +29,16 @@ PAGE = 4096  # [bytes] alignment of readback buffers, which a disk then writes w
 @contextlib.contextmanager
 def stream_of(tensor: Tensor) -> Iterator[None]:
     """Context in which Warp launches on torch's current stream of the tensor's device, while other
-    threads of the program wait.
+    threads of the program wait; on a CPU there is no stream, and nothing to wait for.
 
     Raises:
         ResourceError: If this process was forked from one that had used CUDA.
     """
     runtime.start()
+    if not tensor.is_cuda:
+        yield
+        return
     with runtime.LAUNCHING:
-        if not tensor.is_cuda:
-            yield
-            return
         if torch.cuda._is_in_bad_fork():
             raise ResourceError(
                 "CUDA cannot be used after a fork",

@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.motion.displace import make_displace
 from ..scene.motion import KeyMotion
+from . import runtime
 from .bridge import array_over
 from .cuda import stream_of
 
@@ -129,5 +130,5 @@ def _launch(kernel: str, offset: Float[Tensor, "K N 3"], inputs: list, outputs: 
     """One thread per Gaussian, on torch's stream."""
     keys, count, _ = offset.shape
     with stream_of(offset):
-        where = {"device": wp.device_from_torch(offset.device), "record_tape": False}
-        wp.launch(getattr(make_displace(keys), kernel), count, inputs, outputs, **where)
+        device = wp.device_from_torch(offset.device)
+        runtime.launch(getattr(make_displace(keys), kernel), count, inputs, outputs, device=device)

@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.training import image_similarity, noise, optical_flow, ordered_sums
 from ..scene.camera import Camera
+from . import runtime
 from .bridge import array_over
 from .cuda import stream_of
 
@@ -41,7 +42,7 @@ def launch(
     with stream_of(outputs[0]):
         device = wp.device_from_torch(outputs[0].device)
         arrays = [argument(value) for value in inputs], [argument(value) for value in outputs]
-        wp.launch(kernel, dim, *arrays, device=device, record_tape=False, block_dim=block_dim)
+        runtime.launch(kernel, dim, *arrays, device=device, block_dim=block_dim)
 
 
 class Scratch:

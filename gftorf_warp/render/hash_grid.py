@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..kernels.volume import hash_grid as kernels
+from . import runtime
 from .bridge import array_over
 from .cuda import stream_of
 
@@ -119,5 +120,5 @@ def _launch(
     inputs = [array_over(points, wp.vec3), array_over(times, wp.int32), array_over(table, wp.vec2)]
     inputs += [array_over(each, wp.int32) for each in levels[:3]]
     with stream_of(table):
-        where = {"device": wp.device_from_torch(table.device), "record_tape": False}
-        wp.launch(kernel, size, [*inputs, levels.times, *more], outputs, **where)
+        device = wp.device_from_torch(table.device)
+        runtime.launch(kernel, size, [*inputs, levels.times, *more], outputs, device=device)

@@ -15,6 +15,7 @@ from ..kernels.motion.move import make_move
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import KeyMotion, Motion
+from . import runtime
 from .bridge import array_over
 from .buffers import RenderSettings
 from .cuda import stream_of
@@ -87,11 +88,11 @@ class MovedGaussians:
         camera = view_of(optimised, settings)
         inputs = [*initial, quaternion, offset, rotation, camera, camera]
         inputs += [self._indices(), self._weights()]
-        where = {"device": device, "record_tape": False}
+        where = {"device": device, "record_cmd": True}
         # packed once: that is most of what a launch costs a host
         with stream_of(field.mean):
-            self._launch = wp.launch(
-                kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where
+            self._launch = runtime.launch(
+                kernel, max(len(field), 1), inputs, [*outputs, self.view], **where
             )
 
     @torch.no_grad()

@@ -193,7 +193,7 @@ class Replay:
         launch.forward(inputs, target.view, buffers, target.images, differentiable=False)
         if len(self._like):
             counts, where = [self._largest, target.pairs], {"device": self.device}
-            wp.launch(note_largest, 1, [buffers.total], counts, record_tape=False, **where)
+            runtime.launch(note_largest, 1, [buffers.total], counts, **where)
 
     def _target(self, height: int, width: int, lens: bool) -> Target:
         """Memory for renderings of one size, through a lens or not."""

@@ -1,7 +1,8 @@
 """Warp in this process: its start, its messages in our log, and the lock of launches.
 
 Warp's modules, tape and streams belong to the process. Two threads that launch at once can crash
-while one of them loads a module, and on CUDA one would set the stream of the other.
+while one of them loads a module, so the first launch of a kernel is made alone; on CUDA, where one
+would set the stream of the other, every launch is. CPU threads render at the same time.
 """
 
 from __future__ import annotations
@@ -9,19 +10,39 @@ from __future__ import annotations
 import functools
 import logging
 import os
-import threading
+from typing import Any
 
 import warp as wp
 
+from ..kernels.making import LOCK
+
 LOG = logging.getLogger("gftorf_warp")
-LAUNCHING = threading.RLock()
-"""Held while kernels are launched; the threads of a launch (side_by_side.py) do not need it."""
+LAUNCHING = LOCK
+"""Held while kernels are made, during the first launch of each, and during all on CUDA."""
+_LAUNCHED: set[tuple[wp.Kernel, int | None]] = set()
+"""Kernels with block sizes that were launched on a CPU, so that their modules are loaded."""
 
 if hasattr(
     os, "register_at_fork"
 ):  # a forked process must not inherit a lock that another thread holds
     _release = LAUNCHING.release
     os.register_at_fork(before=LAUNCHING.acquire, after_in_parent=_release, after_in_child=_release)
+
+
+def launch(kernel: wp.Kernel, dim: Any, inputs: list, outputs: list, **options: Any) -> wp.Launch:
+    """``wp.launch`` that no tape records. While a thread launches on CUDA, or a kernel for the
+    first time, which may compile and load its module, no other one does so.
+    """
+    options["record_tape"] = False
+    on_cpu = wp.get_device(options["device"]).is_cpu
+    variant = kernel, options.get("block_dim")
+    if on_cpu and variant in _LAUNCHED:
+        return wp.launch(kernel, dim, inputs, outputs, **options)
+    with LAUNCHING:
+        command = wp.launch(kernel, dim, inputs, outputs, **options)
+    if on_cpu:
+        _LAUNCHED.add(variant)
+    return command
 
 
 class WarpLog:

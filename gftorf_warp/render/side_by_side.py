@@ -10,8 +10,8 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-import warp as wp
 
+from . import runtime
 from .buffers import Buffers
 
 
@@ -38,13 +38,13 @@ def over_tiles(buffers: Buffers, kernel, edges: list[int], arguments, warps: int
     """Launch over ranges of tiles, each with ``warps`` warps per tile; on the CPU concurrently."""
     side_by_side = len(edges) > 2
     commands = [
-        wp.launch(
+        runtime.launch(
             kernel,
-            dim=((stop - start) * warps, buffers.lanes),
-            inputs=arguments(start, part),
+            ((stop - start) * warps, buffers.lanes),
+            arguments(start, part),
+            [],
             device=buffers.device,
             block_dim=32 if buffers.cooperative else 128,
-            record_tape=False,
             record_cmd=side_by_side,
         )
         for part, (start, stop) in enumerate(pairwise(edges))

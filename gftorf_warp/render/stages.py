@@ -24,6 +24,7 @@ from ..kernels.rasterise.composite_backward import (
 )
 from ..kernels.rasterise.list_segments import PLANES
 from ..kernels.rasterise.project import make_project
+from . import runtime
 from .buffers import Buffers, ClampGradient, Distortion, Planes, Stop, Support
 from .inputs import Images, Inputs, View
 from .side_by_side import over_tiles, tile_edges
@@ -392,7 +393,7 @@ def _lanes(buffers: Buffers, planes: Planes | None) -> wp.array:
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:
     where = {"device": next(a.device for a in outputs if isinstance(a, wp.array))}
-    wp.launch(kernel, dim, inputs, outputs, record_tape=False, **where, **adjoint)
+    runtime.launch(kernel, dim, inputs, outputs, **where, **adjoint)
 
 
 @cache

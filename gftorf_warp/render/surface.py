@@ -56,7 +56,7 @@ def surface(
     inputs = [views, bool(cameras[0].distortion), images, origin, voxel, TRUNCATION * voxel]
     with runtime.LAUNCHING:
         outputs = [field, hidden]
-        wp.launch(fuse, nodes, inputs, outputs, device=device, record_tape=False)
+        runtime.launch(fuse, nodes, inputs, outputs, device=device)
         high = origin + voxel * wp.vec3(*(float(n - 1) for n in nodes))
         mesh = IsoSurfaceMarchingCubes.extract(field, 0.0, lower=origin, upper=high)
     vertices, corners = (array.numpy() for array in mesh)

@@ -293,21 +293,19 @@ class Tracer:
     def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
         """Launch over the rows, interleaved among CPU threads to balance their work."""
         parts = self._parts
-        with runtime.LAUNCHING:
-            commands = [
-                wp.launch(
-                    kernel,
-                    dim=(len(range(part, self.height, parts)), self.width),
-                    inputs=[*inputs, part, parts],
-                    outputs=outputs,
-                    device=self.device,
-                    record_tape=False,
-                    record_cmd=parts > 1,
-                )
-                for part in range(parts)
-            ]
-            if parts > 1:
-                run_side_by_side(commands, parts)
+        commands = [
+            runtime.launch(
+                kernel,
+                (len(range(part, self.height, parts)), self.width),
+                [*inputs, part, parts],
+                outputs,
+                device=self.device,
+                record_cmd=parts > 1,
+            )
+            for part in range(parts)
+        ]
+        if parts > 1:
+            run_side_by_side(commands, parts)
 
     def _empty(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.empty(shape, dtype=dtype, device=self.device)

@@ -13,16 +13,17 @@ of a flow minus those of its start. K is a constant: loops are unrolled.
     dL/ds   = (g - n (n . g)) / |s|,   g = dL/dturned q*
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from .. import making
+
 OPTIONS = {"enable_backward": False, "module": "unique", "grid_stride": False}
 
 
-@functools.cache
+@making.once
 def make_interpolation(K: int) -> SimpleNamespace:
     """Vectors of K indices and of K weights, and the weighted sum of K rows of an array."""
     Indices, Weights = wp.types.vector(length=K, dtype=int), wp.types.vector(length=K, dtype=float)
@@ -54,7 +55,7 @@ def conjugate(a: wp.vec4) -> wp.vec4:
     return wp.vec4(a[0], -a[1], -a[2], -a[3])
 
 
-@functools.cache
+@making.once
 def make_displace(K: int) -> SimpleNamespace:
     """The kernels ``displace`` and ``displace_backward`` for K keys."""
     sums = make_interpolation(K)

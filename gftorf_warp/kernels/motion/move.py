@@ -6,10 +6,9 @@ z-depth and f the focal length of the camera of the optimisation, and z', f' tho
     exp(2 log_scale') = exp(2 log_scale) + low_pass max(0, (z / f)^2 - (z' / f')^2)
 """
 
-import functools
-
 import warp as wp
 
+from .. import making
 from ..geometry import CameraView
 from .displace import OPTIONS, make_interpolation, product
 
@@ -21,7 +20,7 @@ def squared_footprint(camera: CameraView, point: wp.vec3) -> float:
     return z * z / (camera.fx * camera.fy)
 
 
-@functools.cache
+@making.once
 def make_move(K: int) -> wp.Kernel:
     """The kernel ``move_gaussians`` for times with K keys; unused keys have weight zero."""
     sums = make_interpolation(K)

@@ -13,12 +13,12 @@ composite_backward.py. Distance and light are those of the splat's centre, or, o
 the pixel (splat_distance.py).
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from ...constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from .. import making
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE
 from .list_segments import PLANES, segment_length
 from .shared_batches import (
@@ -58,7 +58,7 @@ def options(K: int) -> dict:
     }
 
 
-@functools.cache
+@making.once
 def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
     """Position of a lane's block of K pixels in a tile of ``tile_width`` x ``tile_height`` [px]."""
     side = make_lanes(K).side
@@ -85,7 +85,7 @@ def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@making.once
 def make_zeta(metric: bool):
     """What distortion is measured on: the distance [m], or the released mapping of it to [0, 1]."""
 
@@ -98,7 +98,7 @@ def make_zeta(metric: bool):
     return zeta_of
 
 
-@functools.cache
+@making.once
 def make_distance(sloped: bool):
     """The distance [m] of a splat's centre, from its record."""
 
@@ -111,7 +111,7 @@ def make_distance(sloped: bool):
     return distance_of
 
 
-@functools.cache
+@making.once
 def make_composite(
     K: int,
     tile_width: int,

@@ -18,11 +18,10 @@ a surface. The distortion is quadratic in w: its tau uses the final sums. Warp's
 forward loop would be silently wrong, since dynamic loops are not replayed.
 """
 
-import functools
-
 import warp as wp
 
 from ...constants import ALPHA_MAX, ALPHA_MIN
+from .. import making
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE
 from .composite import (
     FARTHEST,
@@ -132,7 +131,7 @@ def add_more(grads: wp.array[Splat], i: int, w: V1, g3: V1, g4: V1, g5: V1):
     """Add the gradient of further channels; CPU only, on CUDA ``accumulate_round`` does it."""
 
 
-@functools.cache
+@making.once
 def make_composite_backward(
     K: int,
     tile_width: int,

@@ -5,11 +5,10 @@ There is no loop that carries a value, so Warp's own adjoint of this kernel is e
 sections 3.3-3.5).
 """
 
-import functools
-
 import warp as wp
 
 from ...constants import ALPHA_MIN, SH_BIAS
+from .. import making
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
 from ..geometry import CameraView, camera_of, screen_covariance, sigmoid
 from ..harmonics import harmonics
@@ -92,7 +91,7 @@ def veil_of(view: CameraView) -> Splat:
     )  # fmt: skip
 
 
-@functools.cache
+@making.once
 def make_project(
     colour: bool, square: bool, lens: bool = False, sloped: bool = False, adjoint: bool = False
 ):

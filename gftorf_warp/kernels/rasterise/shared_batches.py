@@ -10,11 +10,11 @@ On a CPU records are read directly, and the other functions do nothing. All 32 l
 call each function together.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from .. import making
 from .simd import make_lanes
 from .splat import Splat
 
@@ -51,7 +51,7 @@ def shared_floats(values: int, derivatives: int) -> int:
     return _RECORDS + 4 * PIXELS * derivatives + kept
 
 
-@functools.cache
+@making.once
 def make_warp_memory(values: int = 0, derivatives: int = 0, more: bool = False) -> wp.Function:
     """Function for the start of a warp's shared memory: :func:`shared_floats`, further channels."""
     floats = shared_floats(values, derivatives) + _MORE * more
@@ -188,7 +188,7 @@ def more_of(
     """The further channels of entry ``at``, which is number ``k`` of the pairs."""
 
 
-@functools.cache
+@making.once
 def make_gradient_rounds(
     tile_width: int,
     light: bool,

@@ -5,11 +5,12 @@ A compositor thread owns a block of K pixels: on the CPU K = 16, a block of 4 x 
 is one vector instruction; on CUDA K = 1. Each operation is one C++ expression over a type ``F``.
 """
 
-import functools
 import math
 from types import SimpleNamespace
 
 import warp as wp
+
+from .. import making
 
 # e^x for -87 < x <= 0 without libm's call per lane (3.6 times slower): 2^n times a minimax
 # polynomial of 2^f, f in [-1/2, 1/2], error 2.4e-7. Adding 1.5 * 2^23 rounds to an integer.
@@ -173,7 +174,7 @@ def contracted() -> dict:
     return {"cpu_compiler_flags": flags + " -ffp-contract=fast"}
 
 
-@functools.cache
+@making.once
 def make_lanes(K: int) -> SimpleNamespace:
     """Operations on K pixels and their type ``V``; Warp's 16-vectors compile for a minute."""
     if K not in (1, 16):

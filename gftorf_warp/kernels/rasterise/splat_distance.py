@@ -13,11 +13,11 @@ needles and sheets that are seen edge-on, whose footprint is wider than they are
 while g has no limit. Where a pixel is clamped it has no derivative by g; the bound never has one.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from .. import making
 from ..geometry import CameraView, rotation_of
 from ..lens import derivative, inside
 from .simd import elementwise, make_lanes
@@ -60,7 +60,7 @@ _POLYNOMIALS = {
 }
 
 
-@functools.cache
+@making.once
 def make_slopes(K: int) -> SimpleNamespace:
     """What a sloped splat adds to the operations on the K pixels of a thread."""
     V = make_lanes(K).V

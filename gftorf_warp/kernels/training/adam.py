@@ -10,9 +10,9 @@ A table holds the addresses of the tensors; without a gradient (0) it is left al
 gradients of a tensor, of as many images, are summed in order and scaled first.
 """
 
-import functools
-
 import warp as wp
+
+from .. import making
 
 PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH, MORE = range(7)  # columns of the table
 GRADIENTS = 4  # of a tensor, which are summed: one at ``GRADIENT``, others from ``MORE`` on
@@ -72,7 +72,7 @@ def _descend(K: int) -> str:
 """
 
 
-@functools.cache
+@making.once
 def make_adam(K: int):
     """The kernel that works on K elements per thread: 1 on CUDA, 16 on the CPU."""
 

@@ -14,13 +14,13 @@ the derivative needs three planes of dS: W is symmetric, so
 Planes in between have margins of zeros at both ends of a row.
 """
 
-import functools
 import math
 from types import SimpleNamespace
 
 import warp as wp
 
 from ...constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
+from .. import making
 from ..rasterise.simd import contracted
 from .ordered_sums import OVER_LANES
 
@@ -157,7 +157,7 @@ def _gradient(K: int) -> str:
 """
 
 
-@functools.cache
+@making.once
 def make_similarity(K: int) -> SimpleNamespace:
     """Four kernels for blocks of K pixels of a row; a last block begins earlier to fit."""
     options = {"enable_backward": False, "module": "unique", "grid_stride": False}
