@@ -150,15 +150,18 @@ def slope(hours: Sequence[float], values: Sequence[float]) -> tuple[float, float
 
 
 def grown(states: Sequence[State]) -> list[str]:
-    """What grew in the second half: memory whose slope is beyond its noise and makes a MiB, and
-    numbers whose least value in the last tenth is above the largest one before.
+    """What grew in the second half: memory whose slope is beyond its noise and whose least value in
+    the last tenth is a MiB above that in the first one, since pages that the C library returns and
+    takes again make resident memory hop; and numbers whose least value in the last tenth is above
+    the largest one before.
     """
     hours, found = [state.hours for state in states], []
-    for name in MEMORY:
-        steep, error = slope(hours, [getattr(state, name) for state in states])
-        if steep > ERRORS * error and steep * (hours[-1] - hours[0]) > MEMORY_MIB:
-            found.append(name)
     last = max(1, len(states) // 10)
+    for name in MEMORY:
+        values = [getattr(state, name) for state in states]
+        steep, error = slope(hours, values)
+        if steep > ERRORS * error and min(values[-last:]) - min(values[:last]) > MEMORY_MIB:
+            found.append(name)
     for name in NUMBERS:
         values = [getattr(state, name) for state in states]
         if min(values[-last:]) > max(values[:-last]):

@@ -64,9 +64,13 @@ def test_growth_is_found_and_noise_is_not():
     def noise(n):
         return 100 + 3 * (n % 3)
 
+    def hops(n):
+        return 100 + 3 * (n > 9 and n % 9 > 0)  # up in round 10, down for round 18
+
     assert soak.grown(states()) == []
     assert soak.grown(states(resident_mib=noise, threads=noise)) == []
     assert soak.grown(states(anonymous_mib=lambda n: noise(n) + 0.7 * n)) == ["anonymous_mib"]
+    assert soak.grown(states(resident_mib=hops)) == []
     assert soak.grown(states(temporary=lambda n: n)) == ["temporary"]
     assert soak.grown(states(descriptors=lambda n: 5 + (n > 11))) == []
     late = states()
