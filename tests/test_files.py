@@ -216,6 +216,37 @@ def test_exr_of_slices_flips_and_fortran_order_holds_the_right_pixels(tmp_path):
     assert names(tmp_path) == ["a.exr"]
 
 
+PRINTING = """
+import sys, threading
+from gftorf_warp.data.exr import read_exr
+
+sys.setswitchinterval(1e-6)
+ended = threading.Event()
+
+def read():
+    while not ended.is_set():
+        read_exr(sys.argv[1])
+
+threads = [threading.Thread(target=read) for _ in range(2)]
+for thread in threads:
+    thread.start()
+for k in range(20000):
+    print(k)
+ended.set()
+for thread in threads:
+    thread.join()
+"""
+
+
+def test_one_thread_prints_while_others_read_exr(tmp_path):
+    """Reading replaces stdout to silence OpenEXR: the replaced stream must not be freed."""
+    write_exr(tmp_path / "a.exr", {"Z": np.zeros((2, 3))})
+    command = [sys.executable, "-c", PRINTING, str(tmp_path / "a.exr")]
+    result = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.split() == [str(k) for k in range(20000)]
+
+
 @pytest.mark.parametrize(
     "images", [{}, {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, {"a": np.zeros(4)}]
 )

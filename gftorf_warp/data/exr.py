@@ -178,28 +178,36 @@ def _read(path: Path, parts_max: int) -> Parts:
 
 
 class _OtherThreads:
-    """A stream to which all threads but the one that makes it write."""
+    """Standard output of all threads but one.
 
-    def __init__(self, stream: Any):
-        self._stream, self._silent = stream, threading.get_ident()
+    One object for the whole process: ``print`` holds no reference to the stream it writes to, so
+    one that was freed while another thread printed would crash the process.
+    """
+
+    stream: Any = None
+    silent: int | None = None  # identity of the thread
 
     def write(self, text: str) -> int:
         """Write, or drop, a text."""
-        return len(text) if threading.get_ident() == self._silent else self._stream.write(text)
+        return len(text) if threading.get_ident() == self.silent else self.stream.write(text)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+        return getattr(self.stream, name)
+
+
+_OTHER_THREADS = _OtherThreads()
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
     """Drop what OpenEXR prints to stdout about damaged pixels: their channels are missing, too."""
     with _PRINTING:
-        before, sys.stdout = sys.stdout, _OtherThreads(sys.stdout)
+        _OTHER_THREADS.stream, _OTHER_THREADS.silent = sys.stdout, threading.get_ident()
+        sys.stdout = _OTHER_THREADS
         try:
             yield
         finally:
-            sys.stdout = before
+            sys.stdout, _OTHER_THREADS.silent = _OTHER_THREADS.stream, None
 
 
 def _unreadable(path: Path, parts_max: int, actual: str) -> InputError:
