@@ -10,18 +10,19 @@ from small_runs import KEYS, field, random, small
 
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.errors import UsageError
-from gftorf_warp.recon import densify, presets
+from gftorf_warp.recon import densify, presets, renderings
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.run import Run
-from gftorf_warp.recon.settings import DensifySettings
+from gftorf_warp.recon.settings import Batch, DensifySettings
 from gftorf_warp.recon.state import begin, from_dict, to_dict
+from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.train import chosen_settings
 from gftorf_warp.render import api, reference
 from gftorf_warp.render.buffers import RenderSettings, SplatDistance
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
-from gftorf_warp.scene.motion import MotionSettings, MotionStart
+from gftorf_warp.scene.motion import Motion, MotionSettings, MotionStart
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.scene.windows import Windows
 
@@ -309,6 +310,53 @@ def test_split_and_cloned_gaussians_stay_in_their_window():
         window = motion.keys_at(time).index[0] // 2
         away = motion.at(binding, time).offset.abs().amax(dim=1) > 1e5
         assert torch.equal(away, (grown.layer != 0) & (grown.layer != 1 + window))
+
+
+@pytest.mark.parametrize("batch", [Batch.QUARTET, Batch.FRAME])
+def test_gaussians_of_other_windows_take_no_part_in_a_step(batch, monkeypatch):
+    """Same bits as with all of them in every rendering, moments and statistics included, while
+    fewer are rendered; with densification, which changes which rows they are.
+    """
+    settings = presets.best()
+    settings = replace(
+        settings,
+        schedule=replace(settings.schedule, batch=batch),
+        densify=DensifySettings(every=40, start=30, gradient_min=1e-5, opacity_min=0.01),
+    )
+    observations, ends, rendered = observe(small(), settings, "cpu"), [], []
+
+    def counted(field, *given, **more):
+        rendered[-1].append(len(field))
+        return api.rasterize(field, *given, **more)
+
+    monkeypatch.setattr(renderings, "rasterize", counted)
+    for chooses in (Windows.present, Motion.present):
+        monkeypatch.setattr(Windows, "present", chooses)
+        state = begin(observations, settings, seed=0, device="cpu")
+        rendered.append([])
+        steps = Stepper(state, observations, settings)
+        while state.images < 60:
+            steps.step()
+        steps.collect()
+        ends.append(to_dict(state))
+    one, other = (dict(leaves(end)) for end in ends)
+    assert one.keys() == other.keys()
+    unequal = [name for name in one if not torch.equal(one[name], other[name])]
+    assert not unequal
+    assert all(few < 0.8 * every for few, every in zip(*rendered, strict=True))
+    assert len({*rendered[1]}) > 1, "densification changed their number"
+
+
+def leaves(stored, name=""):
+    """All tensors of a checkpoint by their path."""
+    if isinstance(stored, torch.Tensor):
+        yield name, stored
+    elif isinstance(stored, dict):
+        for key, value in stored.items():
+            yield from leaves(value, f"{name}/{key}")
+    elif isinstance(stored, list | tuple):
+        for n, value in enumerate(stored):
+            yield from leaves(value, f"{name}/{n}")
 
 
 def test_a_state_with_windows_is_stored_and_continues():

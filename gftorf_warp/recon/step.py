@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from ..render import descent, fused
@@ -25,6 +26,7 @@ from .observations import Observations
 from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
 from .renderings import Renderer, primary
+from .rows import AllRows, RenderedRows, add_statistics, rendered_rows
 from .settings import ReconSettings
 from .terms import BatchImage, Term
 
@@ -74,6 +76,7 @@ class Step:
         """Results and sums on the device."""
         self._streams = SideStreams(control.images, device)
         self._scratch: defaultdict[tuple[int, str], fused.Scratch] = defaultdict(fused.Scratch)
+        self._all_rows = AllRows()
         self.renderer = Renderer(observations, settings, self.terms)
         """Renders the images."""
 
@@ -96,15 +99,17 @@ class Step:
             send: Uploads them; None: the caller does, after a capture.
             map_images: ``map``, or that of a thread pool: images are independent.
         """
-        key_motion = self._key_motion(key, motion)
+        keys = self.control.keys(key.keys)
+        rendered = rendered_rows(self.padded, motion, keys)
+        key_motion = motion_at_keys(motion, rendered, keys, frozen=key.frozen)
 
         def image(n: int) -> ImageGradients:
             with self._streams.fork(n):
-                return self._image(n, key, key_motion, render)
+                return self._image(n, key, rendered, key_motion, render)
 
         images = [*map_images(image, range(len(key.images)))]
         self._streams.join()
-        lists = gradient_lists(self.padded, key_motion, images)
+        lists = gradient_lists(self.padded, rendered, key_motion, images, self._all_rows)
         with torch.no_grad():
             table.point(lists, [count for image in images for count in image.pairs])
             if send is not None:
@@ -127,21 +132,16 @@ class Step:
             screens = [image.screen for image in images if image.screen is not None]
             if screens:
                 camera = self.renderer.cameras[primary(key.images[0])]
-                statistics = self.padded.statistics
-                sums = statistics.gradient, statistics.pixels, statistics.weight
-                descent.add_statistics(screens, (camera.width, camera.height), self.output, *sums)
-
-    def _key_motion(self, key: GraphKey, motion: Motion) -> KeyMotion | None:
-        """Motion at all keys of the batch, evaluated once; None: nothing moves yet."""
-        if not key.keys:
-            return None
-        binding = self.padded.binding
-        if motion.follows_means and not key.frozen:
-            binding = motion.bind(self.padded.field)
-        return motion.at_keys(binding, self.control.keys(key.keys))
+                size = camera.width, camera.height
+                add_statistics(self.padded.statistics, rendered, screens, size, self.output)
 
     def _image(
-        self, n: int, key: GraphKey, key_motion: KeyMotion | None, render: RenderSettings
+        self,
+        n: int,
+        key: GraphKey,
+        rendered: RenderedRows,
+        key_motion: KeyMotion | None,
+        render: RenderSettings,
     ) -> ImageGradients:
         """Render one image, evaluate its terms, and differentiate them,
         independently of other images.
@@ -149,9 +149,9 @@ class Step:
         image, control = key.images[n], self.control.image(n, key)
         values = {
             name: value.detach().requires_grad_(not key.frozen)
-            for name, value in self.padded.values.items()
+            for name, value in rendered.values.items()
         }
-        field, leaf = field_of(values, self.padded.layer), None
+        field, leaf = field_of(values, rendered.layer), None
         if key_motion is not None:
             offset, rotation = key_motion
             leaf = KeyMotion(_leaf_of(offset), None if rotation is None else _leaf_of(rotation))
@@ -163,7 +163,7 @@ class Step:
             rows=control.rows,
             mean=field.mean,
             moved=moved,
-            mean_weight=self.padded.mean_weight,
+            mean_weight=rendered.mean_weight,
             flow_cameras=control.flow_cameras,
             scratch=lambda name: self._scratch[n, name],
         )
@@ -196,11 +196,33 @@ class Step:
         return _gradients_of(values, weights, leaves)
 
 
+def motion_at_keys(
+    motion: Motion, rendered: RenderedRows, keys: Int[Tensor, "K"], *, frozen: bool
+) -> KeyMotion | None:
+    """Motion at all keys of the batch, evaluated once; None: nothing moves yet."""
+    if not len(keys):
+        return None
+    binding = rendered.binding
+    if motion.follows_means and not frozen:
+        binding = motion.bind(rendered.field)
+    return motion.at_keys(binding, keys)
+
+
 def gradient_lists(
-    padded: PaddedParameters, key_motion: KeyMotion | None, images: list[ImageGradients]
+    padded: PaddedParameters,
+    rendered: RenderedRows,
+    key_motion: KeyMotion | None,
+    images: list[ImageGradients],
+    all_rows: AllRows,
 ) -> list[list[Tensor | None]]:
-    """Gradients of all leaves as few enough lists, which Adam sums up."""
-    of_values, of_motion = _back_through_motion(padded, key_motion, images)
+    """Gradients of all leaves as few enough lists, which Adam sums up; where some rows were
+    rendered, as one list in the memory of ``all_rows``.
+    """
+    of_values, of_motion = _back_through_motion(padded, rendered, key_motion, images)
+    if rendered.rows is not None:
+        each = zip(*(image.values for image in images), of_values, strict=True)
+        total = all_rows.of([fused.added(same) for same in each], padded, rendered.rows)
+        return [[*total, *of_motion]]
     none: list[Tensor | None] = [None] * len(padded.motion)
     first, *others = [image.values for image in images]
     lists = [[*first, *of_motion], *([*values, *none] for values in others)]
@@ -213,12 +235,15 @@ def gradient_lists(
 
 
 def _back_through_motion(
-    padded: PaddedParameters, key_motion: KeyMotion | None, images: list[ImageGradients]
+    padded: PaddedParameters,
+    rendered: RenderedRows,
+    key_motion: KeyMotion | None,
+    images: list[ImageGradients],
 ) -> tuple[list[Tensor | None], list[Tensor | None]]:
     """Gradients of the field and of the motion parameters through the motion,
     for all images at once.
     """
-    values = [*padded.values.values()]
+    values = [*rendered.values.values()]
     shared = [t for t in key_motion or () if t is not None]
     pairs = [
         (total, tensor)

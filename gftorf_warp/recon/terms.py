@@ -52,11 +52,11 @@ class BatchImage:
     """Row of this image among the quads or phasors ('light'), 'colour', closed-form distances
     ('depth') and 'flow' of the observations: device data, since a CUDA graph serves all images."""
     mean: Float[Tensor, "N 3"]
-    """Undisplaced centres [m]."""
+    """Undisplaced centres [m]. On a CPU of the Gaussians that exist at the times of the batch."""
     moved: Float[Tensor, "N 3"] | None
     """Centres at the time of the ToF image [m]; None: nothing moves yet."""
     mean_weight: Float[Tensor, "N"]
-    """Weight of every Gaussian in a mean over Gaussians: 1/N, and 0 for padding rows."""
+    """Weight of every Gaussian in a mean over all Gaussians, and 0 for padding rows."""
     flow_cameras: Float[Tensor, "2 V"]
     """Cameras at both ends of both flows, see :func:`gftorf_warp.render.fused.flow_cameras`."""
     scratch: Callable[[str], fused.Scratch]

@@ -25,7 +25,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from .changes import require
@@ -180,6 +180,14 @@ class Motion(torch.nn.Module, abc.ABC):
         self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]
     ) -> KeyMotion:
         """Motion at keys given by their indices; a tensor of indices is read on its device only."""
+
+    def present(
+        self,
+        binding: Float[Tensor, "N M"],  # noqa: ARG002
+        keys: Int[Tensor, "K"],  # noqa: ARG002
+    ) -> Bool[Tensor, "N"] | None:
+        """Which Gaussians exist at any of these keys; None: all, at all keys."""
+        return None
 
     def keys_at(self, time: float) -> Keys:
         """Keys and interpolation weights of ``time`` [s], any number."""

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .gaussians import GaussianField
@@ -134,6 +134,16 @@ class Windows(Motion):
             whole = (chosen * weight[..., None]).sum(dim=1)
             offset = offset + torch.where(inside, (key % 2) - 0.5, 0.0) * whole
         return KeyMotion(offset, None)
+
+    def present(
+        self, binding: Float[Tensor, "N columns"], keys: Int[Tensor, "K"]
+    ) -> Bool[Tensor, "N"]:
+        """Static Gaussians, and those of the windows of these keys."""
+        label = binding[:, 0].contiguous()
+        exists = label == 0
+        for own in torch.div(keys, 2, rounding_mode="floor") + 1:
+            exists |= label == own
+        return exists
 
     @property
     def key_count(self) -> int:
