@@ -71,8 +71,10 @@ def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
 
 
 def test_without_motion_it_is_much_worse(sample_scores, tmp_path):
-    """The control: the rest of the machinery alone does not explain the result."""
-    still = scores(tmp_path / "run", demo(images=600, motion=MotionSettings(kind="still")))
+    """The control: the rest of the machinery alone does not explain the result. It does not come
+    closer with more images.
+    """
+    still = scores(tmp_path / "run", demo(images=200, motion=MotionSettings(kind="still")))
     assert still["moving"]["d_mse_x100"] > 5 * sample_scores["moving"]["d_mse_x100"]
     assert still["moving"]["d_mse_x100"] > 0.4 * still["moving"]["closed_form_mse_x100"]
 

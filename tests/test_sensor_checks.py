@@ -177,9 +177,9 @@ def test_the_canary_sings(tmp_path):
     """T34: live and small: a fit to rays is more than twice as wrong as an equal fit to its own
     rendering.
     """
-    canary, options = benchmark("canary"), {"images": 900, "device": "cpu"}
+    canary, options = benchmark("canary"), {"images": 300, "device": "cpu"}
     sequence = simulate(
-        "demo", tmp_path / "rays", size=(64, 48), noise=False, **canary.ROWS[canary.SOURCE]
+        "demo", tmp_path / "rays", size=(48, 36), noise=False, **canary.ROWS[canary.SOURCE]
     )
     run = reconstruct(sequence, tmp_path / "run", canary.PRESET, **options)
     own = canary.own_model(run, tmp_path / "own")
