@@ -186,19 +186,18 @@ def test_module_names_no_device_and_launches_nowhere_else(path):
     """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says,
     streams likewise.
     """
+    name, below = name_of(path), path.parent != ROOT
     for node in ast.walk(ast.parse(path.read_text())):
-        if path.parent != ROOT:
-            named = getattr(node, "attr", None) == "cuda" and name_of(path) not in KNOWS_STREAMS
+        if below:
+            named = getattr(node, "attr", None) == "cuda" and name not in KNOWS_STREAMS
             assert not named, f"line {node.lineno}: follow the device of the input"
             text = (
-                node.value
-                if isinstance(node, ast.Constant) and name_of(path) not in KNOWS_KINDS
-                else None
+                node.value if isinstance(node, ast.Constant) and name not in KNOWS_KINDS else None
             )
             assert not (isinstance(text, str) and re.fullmatch(r"cuda(:\d+)?", text)), (
                 f"line {node.lineno}: {text}"
             )
-        if name_of(path) not in LAUNCHES:
+        if name not in LAUNCHES:
             assert getattr(node, "attr", None) not in {"launch", "launch_tiled"}, (
                 f"line {node.lineno}: a launch"
             )
@@ -254,7 +253,8 @@ def test_everything_public_says_what_it_is(path):
 def kernels():
     """Yield every @wp.kernel of the package, also those that a factory makes."""
     for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text)) if "@wp.kernel" in text else ():
             if isinstance(node, ast.FunctionDef) and any(
                 "kernel" in ast.unparse(d) for d in node.decorator_list
             ):
@@ -271,7 +271,10 @@ def comment_of(source, number):
     return comment
 
 
-@pytest.mark.parametrize(("path", "node"), list(kernels()))
+KERNELS = list(kernels())
+
+
+@pytest.mark.parametrize(("path", "node"), KERNELS)
 def test_kernel_signature_is_readable(path, node):
     """Kernels live in kernels/, list inputs then outputs,
     type every parameter and say its [shape] or [unit].
@@ -292,7 +295,7 @@ def test_kernel_signature_is_readable(path, node):
 
 def test_there_are_kernels_to_look_at():
     """The test above is parametrised by what it finds; finding nothing must not pass."""
-    assert len(list(kernels())) >= 8
+    assert len(KERNELS) >= 8
 
 
 def module_of(path):
@@ -382,6 +385,7 @@ def test_no_exception_is_kept_for_a_class_that_became_small():
     classes = {
         f"{name_of(path)}:{node.name}": node
         for path in FILES
+        if any(name.startswith(f"{name_of(path)}:") for name in LARGE_CLASSES)
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ClassDef)
     }
@@ -415,8 +419,11 @@ def device_values():
     Warp.
     """
     for path in FILES:
-        source = path.read_text().splitlines()
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        if "@wp." not in text:
+            continue
+        source = text.splitlines()
+        for node in ast.walk(ast.parse(text)):
             kinds = "".join(map(ast.unparse, getattr(node, "decorator_list", [])))
             if isinstance(node, ast.FunctionDef) and "kernel" in kinds:
                 values = [(arg.arg, arg.lineno) for arg in node.args.args]

@@ -136,13 +136,13 @@ def test_sphere(radius, in_mhz, reflectance, device):
 
 @pytest.mark.slow
 def test_sphere_closely():
-    """T20: 0.1 mm plus 4 sigma with so many paths that 4 sigma are less than 0.4 mm,
+    """T20: 0.1 mm plus 4 sigma with so many paths that 4 sigma are less than 0.8 mm,
     and the gain within 0.1 %.
     """
-    light, direct, _ = traced_sphere(1.0, 0.5, 2e7, Bounces(count=6, paths=1792))
+    light, direct, _ = traced_sphere(1.0, 0.5, 2e7, Bounces(count=6, paths=448))
     ratio, want = (light / direct).astype(np.complex128), sphere_gain(1.0, 0.5, 2e7, 6)
     sigma = abs(shift_of(ratio / ratio.mean(), 2e7).std()) / math.sqrt(ratio.size)
-    assert sigma < 1e-4
+    assert sigma < 2e-4
     assert abs(shift_of(ratio.mean(), 2e7) - shift_of(want, 2e7)) < 1e-4 + 4 * sigma
     assert abs(abs(ratio.mean()) / abs(want) - 1) < 1e-3
 
@@ -168,7 +168,7 @@ CORNER = {  # z [m]: bias [mm] at 20, 30 and 100 MHz, indirect over direct DC, g
     ("z", "paths"),
     [
         *((z, 100) for z in CORNER),
-        *(pytest.param(z, 2000, marks=pytest.mark.slow) for z in (0.5, 2.0)),
+        *(pytest.param(z, 1000, marks=pytest.mark.slow) for z in (0.5, 2.0)),
     ],
 )
 def test_corner(z, paths, device):

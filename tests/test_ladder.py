@@ -115,7 +115,7 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
     """Nothing is wrong at one instant; asynchrony, noise and bounces each cost what they must,
     where they must.
     """
-    rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL))
+    rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL, paths=64))
     assert [*rows] == [*NAMES]
     assert rows["sync"].all < 1e-6
     assert rows["L0"].moving > 20
@@ -144,6 +144,8 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
             "32x24",
             "--frames",
             "16",
+            "--paths",
+            "64",
             "-q",
             "--out",
             str(tmp_path / "ladder"),

@@ -22,6 +22,7 @@ WARP = """
 #include <cstdio>
 #include <cstring>
 #include <random>
+#include <string>
 #include <thread>
 #include <vector>
 #define __CUDA_ARCH__ 750
@@ -159,14 +160,14 @@ static double walk(int begin, int end, int step) {
     }
     return worst;
 }
-int main() {
+void print_all() {
     const int ends[][2] = {{0, 0}, {5, 6}, {3, 19}, {0, 16}, {7, 40}, {2, 130}, {100, 277}};
     for (auto& e : ends) for (int step : {1, -1}) std::printf("%g\\n", walk(e[0], e[1], step));
 }
 """
 
 LANES = """
-int main() {
+void print_all() {
     std::atomic<int> wrong(0);
     for (int turn = 0; turn < 20; ++turn) in_a_warp([&](int lane) {
         // rows behind the last are empty
@@ -230,7 +231,7 @@ static int list(int words, int share, int capacity) {{
     }});
     return ids != want;
 }}
-int main() {{
+void print_all() {{
     for (int words : {{2, 64, 66, 256}}) for (int share : {{0, 1, 30, 100}})
         for (int capacity : {{0, 1, 100, 1 << 20}}) std::printf("%d\\n",
             list(words, share, capacity));
@@ -267,78 +268,96 @@ SIGNATURES = {
 }
 
 
-def numbers_of(folder, functions, program):
-    """Compile native functions as CUDA would see them, run ``program`` on them,
-    and return what it printed.
-    """
-    parts = [
+def signatures_of(functions):
+    """Native functions as CUDA would see them."""
+    return [
         f"static {SIGNATURES[name]} {{ {function.native_snippet} }}"
         for name, function in functions.items()
     ]
-    (folder / "warp.cpp").write_text("\n".join([WARP, *parts, program]))
-    command = [COMPILER, "-std=c++20", "-O1", "-w", "-pthread", "warp.cpp", "-o", "warp"]
-    subprocess.run(command, cwd=folder, check=True, timeout=120)
-    done = subprocess.run(
-        [folder / "warp"], check=True, timeout=120, capture_output=True, text=True
-    )
-    return [float(line) for line in done.stdout.split()]
 
 
-@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
-@pytest.mark.parametrize(
-    ("light", "channels", "geometry", "spreads", "more", "sloped"),
-    [
-        (True, False, True, False, False, False),
-        (True, True, True, True, False, False),
-        (False, True, False, False, False, False),
-        (True, True, True, False, True, False),
-        (True, False, True, False, False, True),
-        (True, True, True, True, True, True),
-    ],
-)
-def test_rounds_read_every_record_and_sum_every_pixel(
-    light, channels, geometry, spreads, more, sloped, tmp_path
-):
-    """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
+def rounds_of(light, channels, geometry, spreads, more, sloped):
+    """A walk over lists, for the outputs that are asked for."""
     asked = light, channels, geometry, spreads, more, sloped
     rounds = shared_batches.make_gradient_rounds(8, *asked)
     rounds = vars(shared_batches) | vars(rounds)
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
-    values = {
-        "LIGHT": light,
-        "CHANNELS": channels,
-        "GEOMETRY": geometry,
-        "SPREADS": spreads,
-        "MORE": more,
-        "SLOPED": sloped,
-    }
-    constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
-    errors = numbers_of(tmp_path, functions, constants + WALK)
+    names = "LIGHT", "CHANNELS", "GEOMETRY", "SPREADS", "MORE", "SLOPED"
+    constants = [
+        f"const bool {name} = {int(value)};" for name, value in zip(names, asked, strict=True)
+    ]
+    return [*signatures_of(functions), *constants, WALK]
+
+
+ROUNDS = [
+    (True, False, True, False, False, False),
+    (True, True, True, True, False, False),
+    (False, True, False, False, False, False),
+    (True, True, True, False, True, False),
+    (True, False, True, False, False, True),
+    (True, True, True, True, True, True),
+]
+HOMES = {
+    "sum_of_lanes": simd,
+    "of_lane": simd,
+    "two_words": tile_bitmask,
+    "write_ids": tile_bitmask,
+}
+OF_LANES = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
+
+
+@pytest.fixture(scope="module")
+def numbers_of(tmp_path_factory):
+    """What a program prints: one of ROUNDS, "lanes" or "lists". All are compiled at once, since
+    the headers take most of the time.
+    """
+    if COMPILER is None:
+        pytest.skip("needs a C++ compiler")
+    programs = {asked: rounds_of(*asked) for asked in ROUNDS}
+    functions = {name: getattr(simd, name) for name in OF_LANES}
+    programs["lanes"] = [*signatures_of(functions), LANES]
+    functions = {name: getattr(home, name) for name, home in HOMES.items()}
+    programs["lists"] = [*signatures_of(functions), LISTS]
+    parts, calls = [WARP], []
+    for number, lines in enumerate(programs.values()):
+        parts += [f"namespace program_{number} {{", *lines, "}"]
+        calls.append(f"if (number == {number}) program_{number}::print_all();")
+    main = "int main(int, char** given) {\n    const int number = std::stoi(given[1]);"
+    parts += [main, *calls, "}"]
+    folder = tmp_path_factory.mktemp("warp")
+    (folder / "warp.cpp").write_text("\n".join(parts))
+    command = [COMPILER, "-std=c++20", "-O1", "-w", "-pthread", "warp.cpp", "-o", "warp"]
+    subprocess.run(command, cwd=folder, check=True, timeout=300)
+
+    def numbers(name):
+        words = [folder / "warp", str([*programs].index(name))]
+        done = subprocess.run(words, check=True, timeout=120, capture_output=True, text=True)
+        return [float(line) for line in done.stdout.split()]
+
+    return numbers
+
+
+@pytest.mark.parametrize("asked", ROUNDS)
+def test_rounds_read_every_record_and_sum_every_pixel(asked, numbers_of):
+    """Lists of no, one, 16 and many entries, in both directions; sums against float64.
+
+    With and without light, channels, geometry, spreads, more channels and slopes.
+    """
+    errors = numbers_of(asked)
     assert len(errors) == 14
     assert max(errors) < 1e-6
     assert max(errors[-1:]) > 1e-9, "nothing was added"
 
 
-@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
-def test_lanes_find_their_row(tmp_path):
+def test_lanes_find_their_row(numbers_of):
     """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to,
     and a search by all lanes.
     """
-    names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
-    functions = {name: getattr(simd, name) for name in names}
-    assert numbers_of(tmp_path, functions, LANES) == [0.0]
+    assert numbers_of("lanes") == [0.0]
 
 
-@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
-def test_lanes_list_bits(tmp_path):
+def test_lanes_list_bits(numbers_of):
     """A warp writes the ranks of all bits that are set in order,
     and nothing behind what there is room for.
     """
-    homes = {
-        "sum_of_lanes": simd,
-        "of_lane": simd,
-        "two_words": tile_bitmask,
-        "write_ids": tile_bitmask,
-    }
-    functions = {name: getattr(home, name) for name, home in homes.items()}
-    assert numbers_of(tmp_path, functions, LISTS) == [0.0] * 64
+    assert numbers_of("lists") == [0.0] * 64
