@@ -17,7 +17,7 @@ from gftorf_warp.sim.settings import SimSettings
 from gftorf_warp.sim.simulate import scene_of, simulate
 from gftorf_warp.sim.world import Sphere, first_hit
 
-NUMBERS = (*range(64), 159, 174)  # the last two draw their room again
+NUMBERS = (*range(32), 159, 174)  # the last two draw their room again
 SMALL = (32, 24)
 
 

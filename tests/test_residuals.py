@@ -182,7 +182,7 @@ def test_without_motion_nothing_is_said_of_motion():
 
 def test_a_run_that_finds_no_motion_says_so(tmp_path, caplog):
     """The control without motion cannot explain the box, and log and config.json say it."""
-    settings = demo(images=200, motion=MotionSettings(kind="still"))
+    settings = demo(images=120, motion=MotionSettings(kind="still"))
     with caplog.at_level(logging.WARNING):
         run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings)
     assert "does not explain" in caplog.text
@@ -201,7 +201,7 @@ def test_flow_of_the_wrong_sign_shows_as_wrong_motion(tmp_path):
         backward={n: -flow for n, flow in measured.flow.backward.items()},
     )
     for flow, wrong in ((measured.flow, False), (turned, True)):
-        run = reconstruct(replace(measured, flow=flow), tmp_path / str(wrong), demo(images=400))
+        run = reconstruct(replace(measured, flow=flow), tmp_path / str(wrong), demo(images=240))
         found = checked.problems(run.config["explained"])
         assert any("motion is missing or wrong" in text for text in found) == wrong
 

@@ -21,7 +21,7 @@ SIZE = (32, 24)
     [
         {},
         {"engine": "mesh"},
-        {"engine": "mesh", "bounces": 2, "paths": 128},
+        {"engine": "mesh", "bounces": 2, "paths": 256},
         {"exposure_samples": 3},
     ],
     ids=str,
