@@ -71,22 +71,28 @@ def rotation_of(wxyz: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
+def axes_of(view: CameraView, wxyz: wp.vec4) -> wp.mat33:
+    """Own axes of a Gaussian in camera axes, as rows."""
+    return wp.transpose(view.rotation * rotation_of(wxyz))
+
+
+@wp.func
+def screen_covariance(view: CameraView, local: wp.vec3, axes: wp.mat33, scale: wp.vec3) -> wp.vec4:
     """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, and its determinant.
 
     It is J R Sigma R^T J^T plus low-pass. The Jacobian J is taken at ``local`` [m, camera axes],
     clamped to 1.3 half fields of view (method, section 2.2). The determinant is a sum of
     squares: xx yy - xy^2 would cancel for long ellipses.
     """
-    # rows: own axes, in camera axes
-    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))
     inverse_z = 1.0 / local[2]
     limit_x = 0.5 * GUARD * float(view.width) / view.fx
     limit_y = 0.5 * GUARD * float(view.height) / view.fy
     slope_x = wp.clamp(local[0] * inverse_z, -limit_x, limit_x)
     slope_y = wp.clamp(local[1] * inverse_z, -limit_y, limit_y)
-    along_x = axes * wp.vec3(view.fx * inverse_z, 0.0, -view.fx * inverse_z * slope_x)
-    along_y = axes * wp.vec3(0.0, view.fy * inverse_z, -view.fy * inverse_z * slope_y)
+    ray_x = wp.vec3(view.fx * inverse_z, 0.0, -view.fx * inverse_z * slope_x)
+    ray_y = wp.vec3(0.0, view.fy * inverse_z, -view.fy * inverse_z * slope_y)
+    along_x = wp.cw_mul(scale, axes * ray_x)
+    along_y = wp.cw_mul(scale, axes * ray_y)
     return ellipse_of(along_x, along_y, view.low_pass)
 
 

@@ -5,7 +5,7 @@ The formulas, also outside the image, are those of scene/distortion.py.
 
 import warp as wp
 
-from .geometry import CameraView, ellipse_of, rotation_of
+from .geometry import CameraView, ellipse_of
 
 STEPS_MAX = wp.constant(20)  # of Newton; a lens that the host could undo needs a handful
 # [1] of image coordinates, a ten-thousandth of a pixel and float32's own rounding
@@ -76,17 +76,15 @@ def undistorted(view: CameraView, x: float, y: float) -> wp.vec2:
 
 
 @wp.func
-def bent_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
+def bent_covariance(view: CameraView, local: wp.vec3, axes: wp.mat33, scale: wp.vec3) -> wp.vec4:
     """As ``screen_covariance``, with the derivative of the lens times that of the pinhole."""
-    # rows: own axes, in camera axes
-    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))
     inverse_z = 1.0 / local[2]
     slope_x = wp.clamp(local[0] * inverse_z, -view.guard_x, view.guard_x)
     slope_y = wp.clamp(local[1] * inverse_z, -view.guard_y, view.guard_y)
     near = inside(view, slope_x, slope_y)
     slope = derivative(view, near[0], near[1])
-    along_x = axes * wp.vec3(inverse_z, 0.0, -inverse_z * slope_x)
-    along_y = axes * wp.vec3(0.0, inverse_z, -inverse_z * slope_y)
+    along_x = wp.cw_mul(scale, axes * wp.vec3(inverse_z, 0.0, -inverse_z * slope_x))
+    along_y = wp.cw_mul(scale, axes * wp.vec3(0.0, inverse_z, -inverse_z * slope_y))
     return ellipse_of(
         view.fx * (slope[0] * along_x + slope[1] * along_y),
         view.fy * (slope[1] * along_x + slope[2] * along_y),

@@ -56,7 +56,7 @@ def project_backward(
 
 
 def _project_kernel(inputs: Inputs, view: View, buffers: Buffers, *, adjoint: bool = False):
-    square = buffers.settings.support == Support.SIGMA3_TILE16
+    square = not adjoint and buffers.settings.support == Support.SIGMA3_TILE16
     return make_project(inputs.colour_sh is not None, square, view.lens, buffers.sloped, adjoint)
 
 

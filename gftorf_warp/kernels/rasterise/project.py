@@ -10,7 +10,7 @@ import warp as wp
 from ...constants import ALPHA_MIN, SH_BIAS
 from .. import making
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
-from ..geometry import CameraView, camera_of, screen_covariance, sigmoid
+from ..geometry import CameraView, axes_of, camera_of, screen_covariance, sigmoid
 from ..harmonics import harmonics
 from ..lens import bent_covariance, distorted
 from .splat import Splat
@@ -33,11 +33,6 @@ def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
     smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))
     reach = wp.sqrt(wp.max(cutoff, 0.0) + 1.0e-5) + BLOCK_RADIUS / wp.sqrt(smallest)
     return wp.vec2(-0.5 * cutoff, -0.50005 * reach * reach - 1.0e-3)
-
-
-@wp.func_grad(visit_of)
-def adj_visit_of(opacity: float, cov: wp.vec4, adj_ret: wp.vec2):
-    """No derivative: slots 6 and 7 of a gradient record count pixels and sum weights."""
 
 
 @wp.func
@@ -75,6 +70,12 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
 
 
 @wp.func
+def common(a: wp.vec4i, b: wp.vec4i) -> wp.vec4i:
+    """Pixels that are in both of two boxes."""
+    return wp.vec4i(wp.max(a[0], b[0]), wp.max(a[1], b[1]), wp.min(a[2], b[2]), wp.min(a[3], b[3]))
+
+
+@wp.func
 def veil_of(view: CameraView) -> Splat:
     """What a Gaussian without a finite position, size or opacity becomes: NaN in every pixel.
 
@@ -102,8 +103,8 @@ def make_project(
         square: Whether splats are cut by the 3-sigma square (parity with the released code).
         lens: Whether the camera is no pinhole.
         sloped: Whether the distance varies inside a splat: other slots 11-15, see splat.py.
-        adjoint: Whether its adjoint is launched, in which a Gaussian that is not finite is no case
-            of its own: the image is NaN already, and the check costs registers.
+        adjoint: Whether its adjoint is launched, which reads in ``box_px`` what the forward pass
+            culled. A Gaussian that is not finite is no case of its own: the image is NaN already.
     """
 
     # __sinf would lose the phase beyond +-pi
@@ -130,10 +131,13 @@ def make_project(
         """One thread per Gaussian."""
         n = wp.tid()
         camera = camera_of(view)
-        order[n] = n
-        depth_key[n] = depth_culled
-        box_px[n] = wp.vec4i(0, 0, 0, 0)
-        if wp.static(not adjoint):
+        if wp.static(adjoint):
+            if box_px[n][2] == 0:  # culled
+                return
+        else:
+            order[n] = n
+            depth_key[n] = depth_culled
+            box_px[n] = wp.vec4i(0, 0, 0, 0)
             placed = wp.isfinite(mean[n]) and wp.isfinite(quaternion[n])
             if not (placed and wp.isfinite(log_scale[n]) and wp.isfinite(opacity_logit[n])):
                 depth_key[n] = 0
@@ -142,35 +146,34 @@ def make_project(
                 return
         opacity = sigmoid(opacity_logit[n])
         local = camera.rotation * mean[n] + camera.translation
-        if local[2] < camera.near or local[2] > camera.far or opacity < ALPHA_MIN:
-            return
+        if wp.static(not adjoint):
+            if local[2] < camera.near or local[2] > camera.far or opacity < ALPHA_MIN:
+                return
         log_sizes = log_scale[n]
         scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
+        axes = axes_of(camera, quaternion[n])
         if wp.static(lens):
-            cov = bent_covariance(camera, local, quaternion[n], scale)
+            cov = bent_covariance(camera, local, axes, scale)
             image = distorted(camera, local[0] / local[2], local[1] / local[2])
             x = camera.fx * image[0] + camera.cx
             y = camera.fy * image[1] + camera.cy
         else:
-            cov = screen_covariance(camera, local, quaternion[n], scale)
+            cov = screen_covariance(camera, local, axes, scale)
             x = camera.fx * local[0] / local[2] + camera.cx
             y = camera.fy * local[1] / local[2] + camera.cy
         determinant = cov[3]
-        visit = visit_of(opacity, cov)
-        box = box_of(camera, x, y, cov, -2.0 * visit[0])
-        if wp.static(square):
-            outer = square_of(camera, x - 0.5, y - 0.5, cov)
-            box = wp.vec4i(
-                wp.max(box[0], outer[0]),
-                wp.max(box[1], outer[1]),
-                wp.min(box[2], outer[2]),
-                wp.min(box[3], outer[3]),
-            )
-        if box[2] <= box[0] or box[3] <= box[1]:
-            return
-        box_px[n] = box
-        # bits of positive floats order like the floats
-        depth_key[n] = (wp.cast(local[2], wp.int32) - wp.cast(camera.near, wp.int32)) >> depth_shift
+        visit = wp.vec2(0.0, 0.0)
+        if wp.static(not adjoint):
+            visit = visit_of(opacity, cov)
+            box = box_of(camera, x, y, cov, -2.0 * visit[0])
+            if wp.static(square):
+                box = common(box, square_of(camera, x - 0.5, y - 0.5, cov))
+            if box[2] <= box[0] or box[3] <= box[1]:
+                return
+            box_px[n] = box
+            # bits of positive floats order like the floats
+            behind_near = wp.cast(local[2], wp.int32) - wp.cast(camera.near, wp.int32)
+            depth_key[n] = behind_near >> depth_shift
 
         distance = wp.length(local)
         direction = (mean[n] - camera.centre) / distance
@@ -184,9 +187,9 @@ def make_project(
         along_ray = distance  # or its inverse
         if wp.static(sloped):
             if wp.static(lens):
-                slope = bent_slope_of(camera, local, quaternion[n], scale)
+                slope = bent_slope_of(camera, local, axes, scale)
             else:
-                slope = slope_of(camera, local, quaternion[n], scale)
+                slope = slope_of(camera, local, axes, scale)
             strength = calibration[wp.static(SOURCE_INTENSITY)] * reflectivity
             light = wp.vec3(strength, slope[0], slope[1])
             bound = bound_of(distance, scale)

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .. import making
-from ..geometry import CameraView, rotation_of
+from ..geometry import CameraView
 from ..lens import derivative, inside
 from .simd import elementwise, make_lanes
 from .splat import Splat
@@ -92,33 +92,32 @@ def make_slopes(K: int) -> SimpleNamespace:
 
 
 @wp.func
-def plane_of(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec2:
+def plane_of(local: wp.vec3, axes: wp.mat33, scale: wp.vec3) -> wp.vec2:
     """Derivative of the inverse distance of the peak by the slopes (x/z, y/z) of the ray [1/m]:
-    z / d^2 (w - n), x and y.
+    z / d^2 (w - n), x and y. ``axes``: own axes in camera axes, as rows.
     """
-    axes = view.rotation * rotation_of(wxyz)  # columns: own axes, in camera axes
     n = wp.normalize(local)
-    along = wp.transpose(axes) * n
+    along = axes * n
     smallest = wp.min(scale)
     # P times the smallest variance: for a sheet, P itself would leave the range of floats
     share = wp.vec3(smallest / scale[0], smallest / scale[1], smallest / scale[2])
     weighted = wp.cw_mul(wp.cw_mul(share, share), along)
-    w = axes * weighted / wp.dot(along, weighted)
+    w = wp.transpose(axes) * weighted / wp.dot(along, weighted)
     factor = local[2] / wp.length_sq(local)
     return wp.vec2(factor * (w[0] - n[0]), factor * (w[1] - n[1]))
 
 
 @wp.func
-def slope_of(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec2:
+def slope_of(view: CameraView, local: wp.vec3, axes: wp.mat33, scale: wp.vec3) -> wp.vec2:
     """Derivative of the inverse distance by the image position, of a pinhole [1/(m px)]."""
-    plane = plane_of(view, local, wxyz, scale)
+    plane = plane_of(local, axes, scale)
     return wp.vec2(plane[0] / view.fx, plane[1] / view.fy)
 
 
 @wp.func
-def bent_slope_of(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec2:
+def bent_slope_of(view: CameraView, local: wp.vec3, axes: wp.mat33, scale: wp.vec3) -> wp.vec2:
     """The same of a camera whose lens distorts, by the inverse of the lens' derivative."""
-    plane = plane_of(view, local, wxyz, scale)
+    plane = plane_of(local, axes, scale)
     near = inside(view, local[0] / local[2], local[1] / local[2])
     lens = derivative(view, near[0], near[1])
     area = lens[0] * lens[2] - lens[1] * lens[1]
