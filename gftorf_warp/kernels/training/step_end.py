@@ -11,6 +11,7 @@ from .ordered_sums import LANES, OVER_LANES
 
 # elements of a gradient whose squares one warp sums up: few, since it reads them serially
 PART = 256
+WIDTH = 16  # sums of a part at once on a CPU: one alone would wait for its last addition
 THREADS = 1024  # of the block that finishes a step
 SCREENS = 4  # images whose statistics one launch adds
 RESULTS = 3  # per image and term: the term, its mean squared difference, its mean opacity
@@ -20,9 +21,9 @@ TOTALS = 4  # sums besides the terms: squared difference, opacity, loss, number 
 
 _SQUARES = f"""{OVER_LANES}
 #if defined(__CUDA_ARCH__)
-    const int lane = thread & {LANES - 1}, lanes = {LANES};
+    const int lane = thread & {LANES - 1}, lanes = {LANES}, width = 1;
 #else
-    const int lane = 0, lanes = 1;
+    const int lane = 0, lanes = {WIDTH}, width = {WIDTH};
 #endif
     if (slot >= partials.shape[0]) return;
     int low = 0, high = first_part.shape[0];
@@ -39,14 +40,28 @@ _SQUARES = f"""{OVER_LANES}
     const float *three = gradient({MORE + 1}), *four = gradient({MORE + 2});
     float s = 0.0f;
     if (one != nullptr) {{
+        float sums[width] = {{}};
+        int i = lane;
         #pragma unroll 4
-        for (int i = lane; i < count; i += lanes) {{
+        for (; i + width <= count; i += lanes) {{
+            const long long at = begin + i;
+            float g[width];
+            for (int k = 0; k < width; ++k) g[k] = one[at + k];
+            if (two != nullptr) for (int k = 0; k < width; ++k) g[k] += two[at + k];
+            if (three != nullptr) for (int k = 0; k < width; ++k) g[k] += three[at + k];
+            if (four != nullptr) for (int k = 0; k < width; ++k) g[k] += four[at + k];
+            for (int k = 0; k < width; ++k) sums[k] += g[k] * g[k];
+        }}
+        for (int k = 0; k < width; ++k) s += sums[k];
+#if !defined(__CUDA_ARCH__)
+        for (; i < count; ++i) {{  // behind the last whole vector
             float g = one[begin + i];
             if (two != nullptr) g += two[begin + i];
             if (three != nullptr) g += three[begin + i];
             if (four != nullptr) g += four[begin + i];
             s += g * g;
         }}
+#endif
     }}
     s = over_lanes(s);
     if (writes) partials.data[slot] = s;
