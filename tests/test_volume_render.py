@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from gftorf_warp.recon.volume import composite
 from gftorf_warp.recon.volume.composite import Samples
 from gftorf_warp.recon.volume.network import TimeCodes, VolumeNetwork
+from gftorf_warp.recon.volume.product import linear
 from gftorf_warp.recon.volume.rays import Depths, Views, evenly, mean_pose
 from gftorf_warp.recon.volume.settings import NetworkSettings, TimeCode
 from gftorf_warp.render import reference
@@ -160,6 +161,24 @@ def test_gradients_of_the_network_agree_with_finite_differences():
 
     assert values(points, code)[1].abs().max() > 0.01
     assert torch.autograd.gradcheck(values, (points, code), eps=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_product_is_that_of_a_linear_layer(several):
+    """And so are its gradients, with a bias of the layer or one for each of several parts."""
+    layer = torch.nn.Linear(5, 7, bias=not several).double()
+    rows = torch.rand(2, 6, 5, generator=generator(), dtype=torch.float64).requires_grad_()
+    biases = torch.rand(2, 7, generator=generator(1), dtype=torch.float64).requires_grad_()
+    weight = torch.rand(2, 6, 7, generator=generator(2), dtype=torch.float64)
+    values = linear(layer, rows, biases if several else None)
+    plain = layer(rows) + biases[:, None] if several else layer(rows)
+    assert_close(values, plain)
+    leaves = [rows, layer.weight, biases if several else layer.bias]
+    ours = torch.autograd.grad((values * weight).sum(), leaves)
+    theirs = torch.autograd.grad((plain * weight).sum(), leaves)
+    assert min(each.abs().max() for each in theirs) > 0.1
+    for one, other in zip(ours, theirs, strict=True):
+        assert_close(one, other)
 
 
 def test_an_encoding_is_the_same_with_a_gradient():

@@ -119,7 +119,7 @@ class Ftorf(Volume):
         with self.precision():
             # the flows of its neighbours are of the same products
             rows = points.expand(len(given["own"]), *points.shape)
-            own, flow = self.values_and_flow(rows, given["own"], slice(1), slice(None))
+            own, flow = self.values_and_flow(rows, given["own"], seen=1, flowing=0)
             flows = neighbours(flow, earlier=key.earlier, later=key.later)
             beside, gap = self._beside(key, given, points, flows)
             samples = self.samples(torch.cat([own, beside]), rays, depths, draw=draw)
@@ -151,15 +151,17 @@ class Ftorf(Volume):
         return {}
 
     def values_and_flow(
-        self,
-        points: Float[Tensor, "T R S 3"],
-        quartets: Int[Tensor, "T"],
-        seen: slice,
-        flowing: slice,
+        self, points: Float[Tensor, "T R S 3"], quartets: Int[Tensor, "T"], seen: int, flowing: int
     ) -> tuple[Float[Tensor, "t R S w"], Float[Tensor, "u R S 2 3"]]:
-        """Values of some rows of points at the quartets of the rows, and scene flow [m] of some."""
+        """Values of the first rows of points at the quartets of the rows, ``seen`` of them, and
+        scene flow [m] of those from row ``flowing`` on.
+        """
         trunk = self.trunk(points, quartets)
-        return trunk[seen], self.moving.flow(trunk[flowing], self.box.reach)
+        if seen == flowing:  # the gradient of a split is one copy, that of two slices four
+            values, flows = trunk.split([seen, len(trunk) - seen])
+        else:
+            values, flows = trunk[:seen], trunk[flowing:]
+        return values, self.moving.flow(flows, self.box.reach)
 
     def _beside(
         self, key: FtorfKey, given: Given, points: Float[Tensor, "R S 3"], flows: Neighbours
@@ -173,7 +175,7 @@ class Ftorf(Volume):
         moved += [(points + flow)[None] for flow, _ in ways]
         count = key.before + key.after
         beside, back = self.values_and_flow(
-            torch.cat(moved), given["visited"], slice(count), slice(count, None)
+            torch.cat(moved), given["visited"], seen=count, flowing=count
         )
         gaps = [
             (flow + returned[..., returns, :]).abs().mean()
@@ -193,10 +195,8 @@ class Ftorf(Volume):
             if share != 0.0:
                 beside = quartet + (1 if share > 0 else -1)
                 source = beside if beside in self.box.quartets else quartet
-                nothing, all_rows = slice(0), slice(None)
-                _, flow = self.values_and_flow(
-                    points[None], self.quartet(source), nothing, all_rows
-                )
+                row = points[None]
+                _, flow = self.values_and_flow(row, self.quartet(source), seen=0, flowing=0)
                 points = points + abs(share) * flow[0, ..., BACKWARD if share > 0 else FORWARD, :]
             return self.samples(self.trunk(points[None], self.quartet(quartet))[0], rays, depths)
 

@@ -95,16 +95,12 @@ class GridVolume(Ftorf):
         return self.field.trunk(unit, quartets).unflatten(1, shape)
 
     def values_and_flow(
-        self,
-        points: Float[Tensor, "T R S 3"],
-        quartets: Int[Tensor, "T"],
-        seen: slice,
-        flowing: slice,
+        self, points: Float[Tensor, "T R S 3"], quartets: Int[Tensor, "T"], seen: int, flowing: int
     ) -> tuple[Float[Tensor, "t R S v"], Float[Tensor, "u R S 2 3"]]:
         """Values of some rows and scene flow [m] of some, each of grids of their own."""
         unit, shape = self.unit(points).flatten(1, 2), points.shape[1:3]
-        values = self.field.trunk(unit[seen], quartets[seen])
-        flow = self.field.flow(unit[flowing], quartets[flowing], self.box.reach)
+        values = self.field.trunk(unit[:seen], quartets[:seen])
+        flow = self.field.flow(unit[flowing:], quartets[flowing:], self.box.reach)
         return values.unflatten(1, shape), flow.unflatten(1, shape)
 
     def samples(

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...scene.encoding import encoded, encoded_size, powers_of_two
+from .product import in_precision, linear
 from .settings import NetworkSettings, TimeCode
 
 FLOW_DEVIATION = 1e-5  # of the initial weights of the flow: nothing moves
@@ -99,10 +100,10 @@ class VolumeNetwork(torch.nn.Module):
         self, points: Float[Tensor, "T P 3"], codes: Float[Tensor, "T C"] | None
     ) -> Float[Tensor, "T P w"]:
         """Values of points, in the units of the network, each at the time of its row."""
-        known = encoded(points, self.position_powers, columns=self._columns)
+        known = in_precision(encoded(points, self.position_powers, columns=self._columns))
         values = functional.relu(self._joined("0", known, codes))
         for name, layer in self.hidden.items():
-            product = layer(values)
+            product = linear(layer, values)
             if name in self.entry:
                 product = product + self._joined(name, known, codes)
             values = functional.relu(product)
@@ -112,8 +113,11 @@ class VolumeNetwork(torch.nn.Module):
         self, name: str, known: Float[Tensor, "T P e"], codes: Float[Tensor, "T C"] | None
     ) -> Float[Tensor, "T P w"]:
         """The product of a layer with encoded positions and time codes."""
-        product = self.entry[name](known)
-        return product if codes is None else product + self.time[name](codes)[:, None]
+        entry = self.entry[name]
+        if codes is None:
+            return entry(known)
+        biases = self.time[name](codes)
+        return linear(entry, known, biases if entry.bias is None else biases + entry.bias)
 
     def density(self, trunk: Float[Tensor, "*n w"]) -> Float[Tensor, "*n"]:
         """Density before its ReLU [1/m]."""
@@ -122,8 +126,8 @@ class VolumeNetwork(torch.nn.Module):
     def light(self, trunk: Float[Tensor, "*b R S w"], direction: Float[Tensor, "R 3"]) -> Light:
         """Light of samples of rays in directions of length 1."""
         seen_from = self.seen_from(encoded(direction, self.direction_powers))
-        seen = functional.relu(self.seen(self.bottleneck(trunk)) + seen_from[:, None])
-        light = self.light_head(seen).float()
+        seen = linear(self.seen, linear(self.bottleneck, trunk)) + seen_from[:, None]
+        light = self.light_head(functional.relu(seen)).float()
         return Light(light[..., 0].abs(), torch.sigmoid(light[..., 1:]))
 
     def blend(self, trunk: Float[Tensor, "*n w"]) -> Float[Tensor, "*n"]:
