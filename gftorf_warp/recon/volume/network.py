@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...scene.encoding import encoded, encoded_size, powers_of_two
-from .product import in_precision, linear
+from .product import linear, precision_of
 from .settings import NetworkSettings, TimeCode
 
 FLOW_DEVIATION = 1e-5  # of the initial weights of the flow: nothing moves
@@ -100,7 +100,8 @@ class VolumeNetwork(torch.nn.Module):
         self, points: Float[Tensor, "T P 3"], codes: Float[Tensor, "T C"] | None
     ) -> Float[Tensor, "T P w"]:
         """Values of points, in the units of the network, each at the time of its row."""
-        known = in_precision(encoded(points, self.position_powers, columns=self._columns))
+        dtype = precision_of(points)
+        known = encoded(points, self.position_powers, columns=self._columns, dtype=dtype)
         values = functional.relu(self._joined("0", known, codes))
         for name, layer in self.hidden.items():
             product = linear(layer, values)

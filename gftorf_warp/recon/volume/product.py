@@ -27,13 +27,14 @@ def linear(
         biases: A bias for each of the T, instead of the layer's own.
     """
     bias = layer.bias if biases is None else biases
-    return _Product.apply(*(in_precision(one) for one in (rows, layer.weight, bias)))
+    dtype = precision_of(rows)
+    return _Product.apply(rows.to(dtype), layer.weight.to(dtype), bias.to(dtype))
 
 
-def in_precision(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Values in the precision of autocast; as they are without it."""
+def precision_of(values: Tensor) -> torch.dtype:
+    """The precision of autocast; without it, that of the values."""
     kind = values.device.type
-    return values.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else values
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else values.dtype
 
 
 class _Product(torch.autograd.Function):
