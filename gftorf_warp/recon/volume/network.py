@@ -104,6 +104,7 @@ class VolumeNetwork(torch.nn.Module):
         known = encoded(points, self.position_powers, columns=self._columns, dtype=dtype)
         values = functional.relu(self._joined("0", known, codes))
         for name, layer in self.hidden.items():
+            assert isinstance(layer, torch.nn.Linear)
             product = linear(layer, values)
             if name in self.entry:
                 product = product + self._joined(name, known, codes)
@@ -115,6 +116,7 @@ class VolumeNetwork(torch.nn.Module):
     ) -> Float[Tensor, "T P w"]:
         """The product of a layer with encoded positions and time codes."""
         entry = self.entry[name]
+        assert isinstance(entry, torch.nn.Linear)
         if codes is None:
             return entry(known)
         biases = self.time[name](codes)
