@@ -425,7 +425,7 @@ def compiled(folder):
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not program.exists():
             # a checked longjmp takes another stack for a mistake
-            command = [COMPILER, "-std=c++20", "-O2", "-w", "-U_FORTIFY_SOURCE"]
+            command = [COMPILER, "-std=c++20", "-O1", "-w", "-U_FORTIFY_SOURCE"]
             command += ["block.cpp", "-o", "block"]
             subprocess.run(command, cwd=folder, check=True, timeout=300)
             (folder / "block").rename(program)
