@@ -77,7 +77,7 @@ def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
 def test_reconstruction_with_both_kernel_caches(tmp_path, monkeypatch):
     """The same run twice: the same end, and a curve from image 0 to the last."""
     monkeypatch.setattr("gftorf_warp.bench.reconstruction.QUICK_IMAGES", 8)
-    wanted = command.Wanted(device="cpu", quick=True)
+    wanted = command.Wanted(device="cpu", quick=True, preset="demo")
     seen = []
     path = tmp_path / "bench.json"
     found = command.bench(
