@@ -98,7 +98,7 @@ def sequences(draw):
     return sequence, Truth(distance=distance, known=known)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
 @given(sequences())
 def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
     """Images bit by bit in float32, calibration in float64, whatever is missing;

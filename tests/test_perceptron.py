@@ -128,8 +128,10 @@ def test_finite_differences_agree_in_float64(shape):
     found = Offsets.apply(form, CublasLayers(), place, moment, *parameters)
     want = exact(made, gaussians, torch.ones_like(found), [0, 2])[0]
     torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-13)
-    assert torch.autograd.gradcheck(
-        lambda *values: Offsets.apply(form, CublasLayers(), place, moment, *values), parameters
+    assert torch.autograd.gradcheck(  # along random directions, not one parameter after the other
+        lambda *values: Offsets.apply(form, CublasLayers(), place, moment, *values),
+        parameters,
+        fast_mode=True,
     )
 
 

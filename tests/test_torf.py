@@ -333,7 +333,7 @@ def phasor_sequences(draw):
     return sequence, Truth(distance=np.repeat(distance, 4, axis=0), known=np.repeat(known, 4)), same
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
 @given(phasor_sequences())
 def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
     """Bit by bit, poses of both cameras included, whichever phasor is missing;

@@ -88,10 +88,10 @@ def test_coefficients_are_those_of_the_wave():
 
 def test_two_square_waves_correlate_to_a_triangle():
     """Its peak is all of the light, so contrasts add up to 1; peak() finds that of any wave."""
-    c = contrasts(SQUARE, SQUARE, 999)
-    assert c[0] * peak(contrast_ratios(SQUARE, SQUARE, 999)) == pytest.approx(1.0, abs=1e-3)
+    c = contrasts(SQUARE, SQUARE, 499)
+    assert c[0] * peak(contrast_ratios(SQUARE, SQUARE, 499)) == pytest.approx(1.0, abs=1e-3)
     assert peak(()) == 1.0
-    x = np.linspace(0, 2 * math.pi, 100001)
+    x = np.linspace(0, 2 * math.pi, 10001)
     for ratios in itertools.product((-0.3, 0.2), repeat=3):
         wave = np.cos(x) + sum(r * np.cos(h * x) for h, r in enumerate(ratios, start=2))
         assert peak(ratios) == pytest.approx(np.abs(wave).max(), rel=1e-3)
