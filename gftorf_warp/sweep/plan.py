@@ -140,12 +140,12 @@ class Plan:
     @property
     def fits(self) -> list[Job]:
         """A job for every fit: first all with the first seed."""
+        several = tuple(row for row in self.rows if self._has_seeds(row))
         return [
             Job(scene=scene, row=row, seed=seed)
             for seed in self.seeds
             for scene in self.scenes
-            for row in self.rows
-            if seed == self.seeds[0] or self._has_seeds(row)
+            for row in (self.rows if seed == self.seeds[0] else several)
         ]
 
     def _has_seeds(self, row: Row) -> bool:

@@ -46,8 +46,9 @@ class Line:
 def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
     """All lines: by scene the closed form, every row, and what others published."""
     lines: list[Line] = []
+    good = _good(plan, results)
     for scene in plan.scenes:
-        by_row = _by_row(plan, scene, results)
+        by_row = good[scene.name]
         every = [result for of_row in by_row.values() for result in of_row]
         if every:
             lines.append(_closed_form(scene, every[0]))
@@ -67,11 +68,11 @@ def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
 
 def over_scenes(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
     """Geometric means over the scenes of every error over that of the closed form."""
-    lines = []
+    lines, good = [], _good(plan, results)
     for row in plan.rows:
         cells = {}
         for title in ERRORS:
-            ratios = [_ratio(_by_row(plan, s, results)[row.name], title) for s in plan.scenes]
+            ratios = [_ratio(by_row[row.name], title) for by_row in good.values()]
             known = [ratio for ratio in ratios if ratio]
             if known:
                 mean = math.exp(sum(map(math.log, known)) / len(known))
@@ -176,14 +177,16 @@ def _about(plan: Plan) -> str:
     )
 
 
-def _by_row(plan: Plan, scene: Scene, results: Mapping[str, Result]) -> dict[str, list[Result]]:
-    """Good results of every row on a scene, one per seed."""
-    by_row: dict[str, list[Result]] = {row.name: [] for row in plan.rows}
+def _good(plan: Plan, results: Mapping[str, Result]) -> dict[str, dict[str, list[Result]]]:
+    """Good results by scene and row, one per seed."""
+    good: dict[str, dict[str, list[Result]]] = {
+        scene.name: {row.name: [] for row in plan.rows} for scene in plan.scenes
+    }
     for job in plan.fits:
         result = results.get(job.id)
-        if job.scene == scene and job.row is not None and result and "metrics" in result:
-            by_row[job.row.name].append(result)
-    return by_row
+        if job.row is not None and result and "metrics" in result:
+            good[job.scene.name][job.row.name].append(result)
+    return good
 
 
 def _closed_form(scene: Scene, result: Result) -> Line:
