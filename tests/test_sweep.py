@@ -323,7 +323,7 @@ def test_rows_are_presets_with_and_without_changes(tmp_path):
     assert plan.rows[2].changes == ("render.low_pass=0.3",)
 
 
-def test_a_cluster_does_the_same_jobs(tmp_path):
+def test_a_cluster_does_the_same_jobs(tmp_path, monkeypatch):
     """On two Dask workers; without a scheduler a named error."""
     distributed = pytest.importorskip("distributed", reason="extra cluster is not installed")
     (tmp_path / "plan.toml").write_text(
@@ -339,6 +339,7 @@ def test_a_cluster_does_the_same_jobs(tmp_path):
     assert not [result for result in there.values() if "error" in result]
     for id in ("demo/ctof-0", "demo/temporal-0"):
         assert there[id]["metrics"]["d_mse_x100"] == here[id]["metrics"]["d_mse_x100"]
+    monkeypatch.setattr("gftorf_warp.sweep.cluster.CONNECT_S", 1.0)
     with pytest.raises(ResourceError, match="no Dask scheduler answers"):
         sweep(tmp_path / "plan.toml", tmp_path / "nowhere", scheduler="tcp://127.0.0.1:9")
 
