@@ -22,12 +22,12 @@ UNCHECKED = {
     """.split()
 }
 
-# Files of more than 20 s of CPU, the longest first: what begins last must be short, or a core has
+# Files of more than 15 s, the longest first: what begins last must be short, or a core has
 # nothing to do meanwhile. xdist itself begins with the files of most tests.
 LONGEST = """
-    sweep bounces accuracy look_alikes listed_rows reconstruct bench published_runs volumes
-    splat_distance sensor_checks perceptron stepper import_chain random_scene unfinished long
-    rasterize cycles_recon lens best
+    sweep accuracy look_alikes splat_distance reconstruct bounces listed_rows bench volumes
+    published_runs perceptron view stepper import_chain attempts rasterize cycles_recon random_scene
+    unfinished long processes
     """.split()
 
 
