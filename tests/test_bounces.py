@@ -113,7 +113,7 @@ def test_sphere(radius, in_mhz, reflectance, device):
     """
     harmonics = tuple(f_mhz // 10 for f_mhz in in_mhz)
     for count in (1, 6):
-        bounces = Bounces(count=count, paths=64)
+        bounces = Bounces(count=count, paths=64 if reflectance > 0.5 else 32)
         lights, directs, _ = traced_sphere(
             radius, reflectance, 1e7, bounces, device, harmonics=harmonics
         )

@@ -75,7 +75,8 @@ def ideal_recording(
     if lit != read:
         listed, other = (", ".join(map(str, each)) for each in (lit, read))
         raise ValueError(f"light of {listed} Hz, read by a sensor of {other} Hz")
-    shots = [sensor.at_frame(n) for n in range(scene.frames)]
+    cycle = [sensor.at_frame(n) for n in range(len(sensor.cycle))]
+    shots = [cycle[n % len(cycle)] for n in range(scene.frames)]
     frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     times = frame_times(sensor, scene.frames, sync=False)
     if lights is None:
@@ -90,6 +91,9 @@ def ideal_recording(
         quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
         quads[n] = float(sensor.source_intensity) * quad
         distance[n], known[n] = light.distance, True
-    cameras = [scene.camera(time=float(time)) for time in times]
+    if scene.camera_moves:
+        cameras = [scene.camera(time=float(time)) for time in times]
+    else:
+        cameras = [scene.camera()] * scene.frames
     sequence = Sequence(quads=quads, measured=known, **sequence_fields(sensor, times, cameras))
     return sequence, Truth(distance=distance, known=known)
