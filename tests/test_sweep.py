@@ -128,6 +128,16 @@ def test_the_table_has_means_spreads_and_what_others_published(swept):
     ]
     ratio = np.exp(np.mean(np.log(np.divide(means, closed))))
     assert float(rows["over the closed form", "demo"][0]) == pytest.approx(ratio, rel=6e-3)
+    short = {line[0]: line[1:] for line in table.overview(read_plan(folder / "plan.toml"), results)}
+    assert short["d (d_ToF)"][:3] == ["demo", "box", "over the closed form"]
+    tof = [results[f"demo/demo-{seed}"]["metrics"]["d_tof_mse_x100"] for seed in (0, 1)]
+    assert short["demo"][0] == f"{means[0]:.3g} ({np.mean(tof):.3g})"
+    assert short["demo"][2].startswith(rows["over the closed form", "demo"][0])
+    assert [short["demo"][3], short["ctof"][3]] == ["4", "2"], "fits"
+    assert short["others (other data)"][:3] == ["1.5 (0.5)", "2", "-"]
+    assert (
+        f"| {' | '.join(['demo', *short['demo']])} |" in (folder / "out" / "sweep.md").read_text()
+    )
     page = (folder / "out" / "sweep.html").read_text()
     assert page.count("<img class") == 2, "a picture of each scene"
     assert "others (other data)" in page

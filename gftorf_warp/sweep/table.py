@@ -27,6 +27,9 @@ COSTS = {"seconds": "seconds", "GPU MiB": "memory_mib", "Gaussians": "gaussians"
 UNIT = "mean squared errors of the distance along the ray x 100 [m^2]"
 NONE = "-"
 MARK = " *"  # behind the name of a row that is not all as published
+OTHER_DATA = " (other data)"  # behind the name of what others published
+NOT_APPLIED = "not applied: "
+OVER = "over the closed form"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +64,7 @@ def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
         for name, errors in plan.published.items():
             if scene.name in errors:
                 cells = dict(zip(("all", "d_ToF"), map(_three, errors[scene.name]), strict=False))
-                title = f"{name} (other data)"
+                title = name + OTHER_DATA
                 lines.append(Line(scene=scene.name, row=title, cells=cells, kind="published"))
     return lines
 
@@ -77,8 +80,46 @@ def over_scenes(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
             if known:
                 mean = math.exp(sum(map(math.log, known)) / len(known))
                 cells[title] = f"{mean:.3g}" + _of(len(known), len(ratios))
-        lines.append(Line(scene="over the closed form", row=row.name, cells=cells, kind="ours"))
+        lines.append(Line(scene=OVER, row=row.name, cells=cells, kind="ours"))
     return lines
+
+
+def overview(plan: Plan, results: Mapping[str, Result]) -> list[list[str]]:
+    """Rows by scenes, as the paper's tables have them: error of the distance and, in brackets, of
+    d_ToF, geometric means over the closed form, and what a fit cost. A list of cells for each row,
+    the first of titles.
+    """
+    every = lines_of(plan, results)
+    cells: dict[str, dict[str, str]] = {line.row.removesuffix(MARK): {} for line in every}
+    for line in [*every, *over_scenes(plan, results)]:
+        cells[line.row.removesuffix(MARK)][line.scene] = _in_short(line)
+    for name, costs in _costs(plan, results).items():
+        cells[name] |= costs
+    columns = [*(scene.name for scene in plan.scenes), OVER, "fits", *COSTS]
+    marked = {line.row.removesuffix(MARK) for line in every if line.row.endswith(MARK)}
+    ours = [name for name in cells if not name.endswith(OTHER_DATA)]
+    rows = [
+        [name + MARK if name in marked else name, *(cells[name].get(key, NONE) for key in columns)]
+        for name in [*ours, *(name for name in cells if name.endswith(OTHER_DATA))]
+    ]
+    return [["d (d_ToF)", *columns], *rows]
+
+
+def _costs(plan: Plan, results: Mapping[str, Result]) -> dict[str, dict[str, str]]:
+    """Number of fits of every row, and means of what they cost."""
+    good, costs = _good(plan, results), {}
+    for row in plan.rows:
+        fits = [result for by_row in good.values() for result in by_row[row.name]]
+        costs[row.name] = {"fits": str(len(fits))} | _mean_costs(fits)
+    return costs
+
+
+def _in_short(line: Line) -> str:
+    """Means of d and d_ToF, or why there are none."""
+    given = line.cells.get("all", NONE).removeprefix(NOT_APPLIED)
+    if "d_ToF" not in line.cells:
+        return given.split(" (")[0]
+    return f"{given.split(' (')[0]} ({line.cells['d_ToF'].split(' (')[0]})"
 
 
 def _why_not(plan: Plan, scene: Scene, row: Row, results: Mapping[str, Result]) -> str:
@@ -86,7 +127,7 @@ def _why_not(plan: Plan, scene: Scene, row: Row, results: Mapping[str, Result]) 
     for seed in plan.seeds:
         result = results.get(Job(scene=scene, row=row, seed=seed).id, {})
         if "refused" in result:
-            return f"not applied: {result['refused']}"
+            return NOT_APPLIED + result["refused"]
         if "error" in result:
             return "failed"
     return ""
@@ -126,7 +167,9 @@ def exit_code(results: Iterable[Result]) -> int:
 def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
     """The table as Markdown, with what failed."""
     titles = ["scene", "row", *COLUMNS, *COSTS]
-    text = [f"{_about(plan)}\n", _row(titles), _row(["---"] * len(titles))]
+    short = overview(plan, results)
+    text = [f"{_about(plan)}\n", _row(short[0]), _row(["---"] * len(short[0]))]
+    text += [*map(_row, short[1:]), "", _row(titles), _row(["---"] * len(titles))]
     for line in [*lines_of(plan, results), *over_scenes(plan, results)]:
         cells = (line.cells.get(title, NONE) for title in [*COLUMNS, *COSTS])
         text.append(_row([line.scene, line.row, *cells]))
@@ -140,7 +183,11 @@ def html(plan: Plan, results: Mapping[str, Result], sheets: Mapping[str, Picture
     """The tables as an offline page, with the picture of every scene."""
     body = "<header><h1>Sweep</h1></header>"
     about = page.caption(page.escape(_about(plan)))
-    body += page.section("Over the closed form", about, _html(over_scenes(plan, results), ERRORS))
+    head, *short = overview(plan, results)
+    body += page.section(
+        "All scenes", about, page.table(head, [("", list(map(page.escape, row))) for row in short])
+    )
+    body += page.section("Over the closed form", _html(over_scenes(plan, results), ERRORS))
     if failed := failures(results.values()):
         items = "".join(f"<li>{page.escape(failure)}</li>" for failure in failed)
         body += page.section("What failed", f"<ul>{items}</ul>")
@@ -203,12 +250,19 @@ def _line(scene: Scene, name: str, results: Sequence[Result]) -> Line:
         values = [page.look_up(result["metrics"], key) for result in results]
         if text := _spread([100.0 * v if percent else v for v in values if v is not None]):
             cells[title] = text + (" %" if percent else "")
+    cells |= _mean_costs(results)
+    marked = name + MARK if any(result.get("assumed") for result in results) else name
+    return Line(scene=scene.name, row=marked, cells=cells, kind="ours")
+
+
+def _mean_costs(results: Sequence[Result]) -> dict[str, str]:
+    """By the title of the column."""
+    cells = {}
     for title, key in COSTS.items():
         values = [result[key] for result in results if result.get(key) is not None]
         if values:
             cells[title] = f"{np.mean(values):{'.1f' if title == 'seconds' else '.0f'}}"
-    marked = name + MARK if any(result.get("assumed") for result in results) else name
-    return Line(scene=scene.name, row=marked, cells=cells, kind="ours")
+    return cells
 
 
 def _empty(scene: Scene, name: str, why: str) -> Line:
