@@ -29,13 +29,13 @@ from gftorf_warp.sim.world import first_hit
 from gftorf_warp.sweep import workers
 
 PLACE = workers.Place("cpu")
-TINY = ["--size", "40x30", "--frames", "8", "--images", "24", "--seeds", "0,1", "--workers", "1"]
+TINY = ["--size", "40x30", "--frames", "8", "--images", "8", "--seeds", "0,1", "--workers", "1"]
 
 
 def setup_in(folder):
     """A setup of tiny images."""
     return accuracy_jobs.Setup(
-        out=folder, size=(40, 30), frames=8, images=24, device="cpu", keep=False
+        out=folder, size=(40, 30), frames=8, images=8, device="cpu", keep=False
     )
 
 
@@ -121,14 +121,14 @@ def test_a_benchmark_of_two_scenes(tmp_path, capsys):
     results = {line["id"]: line for line in map(json.loads, lines)}
     floor = results["shared/axial@given"]["floor"]
     assert 0 < floor["static"] < floor["all"] < floor["moving"]
-    fit = results["short/random-1@40x30x8/24/1"]
-    assert fit["scores"]["images_optimised"] == 24
+    fit = results["short/random-1@40x30x8/8/1"]
+    assert fit["scores"]["images_optimised"] == 8
     assert fit["seconds"] > 0
     assert fit["rise"] >= 1
-    closed = results["ctof/random-1@40x30x8/24/0"]["scores"]
+    closed = results["ctof/random-1@40x30x8/8/0"]["scores"]
     assert closed["d_mse_x100"] == pytest.approx(closed["closed_form_mse_x100"])
-    assert "no.such" in results["bad/shared/axial@given/24/0"]["error"]
-    assert "bad/shared/axial@given/24/0: UsageError" in first.out
+    assert "no.such" in results["bad/shared/axial@given/8/0"]["error"]
+    assert "bad/shared/axial@given/8/0: UsageError" in first.out
     picture = cv2.imread(str(tmp_path / "acc" / "worst.png"))
     assert picture.shape[1] >= 4 * 40
     assert (tmp_path / "acc" / "table.md").read_text() in first.out

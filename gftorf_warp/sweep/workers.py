@@ -90,7 +90,9 @@ class Workers:
         self._context: ForkServerContext | SpawnContext = multiprocessing.get_context("spawn")
         if FORKS:
             self._context = multiprocessing.get_context("forkserver")
-            self._context.set_forkserver_preload([work.__module__])
+            # which may lie where a fork server does not look, beside a program: our part of it is
+            # what takes long
+            self._context.set_forkserver_preload([work.__module__, f"{__package__}.job"])
 
     def __enter__(self) -> Workers:
         return self
