@@ -334,15 +334,15 @@ def test_rows_are_presets_with_and_without_changes(tmp_path):
 
 
 def test_a_cluster_does_the_same_jobs(tmp_path, monkeypatch):
-    """On two Dask workers; without a scheduler a named error."""
+    """On a Dask worker, a thread here behind TCP; without a scheduler a named error."""
     distributed = pytest.importorskip("distributed", reason="extra cluster is not installed")
     (tmp_path / "plan.toml").write_text(
         'scenes = ["demo"]\npresets = ["ctof", "temporal"]\n'
         "[simulate]\nsize = [16, 12]\nframes = 8\n"
     )
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    one = {"n_workers": 1, "threads_per_worker": 1, "processes": False}
+    where = {"host": "127.0.0.1", "protocol": "tcp", "dashboard_address": None}
+    with distributed.LocalCluster(**one, **where) as cluster:
         address = cluster.scheduler_address
         there = sweep(tmp_path / "plan.toml", tmp_path / "there", scheduler=address)
     here = sweep(tmp_path / "plan.toml", tmp_path / "here", workers=1)
