@@ -64,7 +64,7 @@ def test_the_sample_is_much_better_than_the_closed_form(sample_scores):
 
 def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
     """Optimised at 80x60 with flow from the quads, compared at 160x120."""
-    found = scores(tmp_path / "run", demo(images=400, width_max=80, flow=FlowSource.DIS))
+    found = scores(tmp_path / "run", demo(images=300, width_max=80, flow=FlowSource.DIS))
     assert found["moving"]["d_mse_x100"] < 0.2 * found["moving"]["closed_form_mse_x100"]
     assert found["d_mse_x100"] < 0.4 * found["closed_form_mse_x100"]
     assert found["flow_source"] == "computed"
@@ -72,9 +72,9 @@ def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
 
 def test_without_motion_it_is_much_worse(sample_scores, tmp_path):
     """The control: the rest of the machinery alone does not explain the result. It does not come
-    closer with more images.
+    closer with more images: 1.80 of the closed form after 60 of them, 1.83 after 200.
     """
-    still = scores(tmp_path / "run", demo(images=200, motion=MotionSettings(kind="still")))
+    still = scores(tmp_path / "run", demo(images=60, motion=MotionSettings(kind="still")))
     assert still["moving"]["d_mse_x100"] > 5 * sample_scores["moving"]["d_mse_x100"]
     assert still["moving"]["d_mse_x100"] > 0.4 * still["moving"]["closed_form_mse_x100"]
 
@@ -99,7 +99,7 @@ def test_keys_start_where_flow_leads_and_at_rest_without():
     "what", ["truncated", "missing frames", "static", "single quartet", "real order, offset, DC"]
 )
 def test_unusual_recordings_are_fitted_too(tmp_path, what, device):
-    """Forty steps clearly reduce the error of the quads."""
+    """Twenty steps clearly reduce the error of the quads."""
     measured = np.ones(12, dtype=bool)
     measured[[2, 3]] = False
     recordings = {
@@ -114,7 +114,7 @@ def test_unusual_recordings_are_fitted_too(tmp_path, what, device):
         ),
     }
     run = reconstruct(
-        recordings[what]()[0], tmp_path / "run", demo(images=160, log_every=16), device=device
+        recordings[what]()[0], tmp_path / "run", demo(images=80, log_every=8), device=device
     )
     found = rows(run.path)
     assert found[-1]["quad_psnr_db"] > found[0]["quad_psnr_db"] + 2.0
@@ -236,7 +236,7 @@ def test_config_and_metrics_say_what_happened(tmp_path):
 
 def test_a_run_is_found_again_and_renders_in_the_units_of_the_file(tmp_path, folder_of_a_sequence):
     """At any time, from any camera."""
-    run = reconstruct(folder_of_a_sequence, tmp_path / "run", demo(images=160))
+    run = reconstruct(folder_of_a_sequence, tmp_path / "run", demo(images=120))
     again = Run.open(run.path)
     assert again.sequence().path == folder_of_a_sequence
     sequence = small()
@@ -279,7 +279,7 @@ def test_random_start_and_still_motion_run_too(tmp_path):
     """The controls, and a sequence without any flow: a few steps reduce the loss."""
     sequence = replace(small(), flow=Flow())
     settings = demo(
-        images=160, log_every=16, init=InitSettings(kind=Init.RANDOM, count=300, opacity=0.3)
+        images=80, log_every=8, init=InitSettings(kind=Init.RANDOM, count=300, opacity=0.3)
     )
     settings = replace(settings, flow=FlowSource.NONE)
     run = reconstruct(sequence, tmp_path / "run", settings)
