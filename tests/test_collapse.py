@@ -22,9 +22,10 @@ BLACK = -3.0  # constant harmonic: reflectivity is clamped at zero from -1.77 on
 
 
 def settings(**more):
-    """Judged after 48 of 120 images; a row of metrics is the mean over all 12."""
-    wanted = small("released", 120)
-    return replace(wanted, schedule=replace(wanted.schedule, log_every=12), **more)
+    """Judged after 32 of 80 images; a row of metrics is the mean over all 8."""
+    wanted = small("released", 80)
+    schedule = replace(wanted.schedule, log_every=8)
+    return replace(wanted, schedule=schedule, init=replace(wanted.init, count=200), **more)
 
 
 def veiled_starts(monkeypatch, starts):
@@ -51,7 +52,7 @@ def test_when_a_run_is_checked_for_a_veil():
     not where Gaussians start from phase.
     """
     wanted = settings()
-    assert collapse.veil_checked_at(wanted) == 48  # one and a half warm-ups of 30
+    assert collapse.veil_checked_at(wanted) == 32  # one and a half warm-ups of 20
     longer = replace(
         wanted, schedule=replace(wanted.schedule, images=20_000, warm_up=2000, log_every=100)
     )
@@ -90,7 +91,7 @@ def test_a_veiled_start_restarts(tmp_path, monkeypatch):
     the run that is left is one that sees.
     """
     seeds = veiled_starts(monkeypatch, 2)
-    run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings(), seed=5)
+    run = reconstruct(recording(frames=8)[0], tmp_path / "run", settings(), seed=5)
     assert seeds == [5, 5 + loop.SEED_STEP, 5 + 2 * loop.SEED_STEP]
     assert run.config["restarts"] == 2
     assert (run.path / "run.log").read_text().count("restarts with another seed") == 2
@@ -100,7 +101,7 @@ def test_a_veiled_start_restarts(tmp_path, monkeypatch):
     )
     monkeypatch.undo()
     undisturbed = reconstruct(
-        recording(frames=12)[0], tmp_path / "other", settings(), seed=seeds[-1]
+        recording(frames=8)[0], tmp_path / "other", settings(), seed=seeds[-1]
     )
     for one, other in zip(
         run.field.tensors().values(), undisturbed.field.tensors().values(), strict=True
@@ -112,10 +113,10 @@ def test_a_veiled_start_restarts(tmp_path, monkeypatch):
 def test_it_does_not_restart_for_ever(tmp_path, monkeypatch):
     """After so many starts it says so, and goes on."""
     seeds = veiled_starts(monkeypatch, 9)
-    run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings(restarts_max=1))
+    run = reconstruct(recording(frames=8)[0], tmp_path / "run", settings(restarts_max=1))
     assert len(seeds) == 2
     assert "it was restarted too often" in (run.path / "run.log").read_text()
-    assert run.config["images_optimised"] == 120
+    assert run.config["images_optimised"] == 80
 
 
 def test_an_interrupted_run_remembers_its_starts(tmp_path, monkeypatch):
@@ -129,18 +130,18 @@ def test_an_interrupted_run_remembers_its_starts(tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(recording(frames=12)[0], tmp_path / "run", settings(), progress=stop)
-    run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings())
+        reconstruct(recording(frames=8)[0], tmp_path / "run", settings(), progress=stop)
+    run = reconstruct(recording(frames=8)[0], tmp_path / "run", settings())
     assert run.config["restarts"] == 1
-    assert run.config["images_optimised"] == 120
+    assert run.config["images_optimised"] == 80
 
 
 def learnt(wanted):
     """A state in the middle of the run."""
-    observations = observe(recording(frames=12)[0], wanted, "cpu")
+    observations = observe(recording(frames=8)[0], wanted, "cpu")
     state = begin(observations, wanted, seed=0, device="cpu")
-    advance(state, observations, wanted, 48)
-    assert state.images == 48
+    advance(state, observations, wanted, 24)
+    assert state.images == 24
     return state
 
 
@@ -193,7 +194,7 @@ def test_a_reinitialised_network_displaces_nothing_and_learns():
         assert all(value.abs().max() == 0 for value in state.optimiser.moments_of(leaf))
     torch.testing.assert_close(state.optimiser.field.mean.detach(), mean, rtol=0, atol=0)
     again = from_dict(to_dict(state), "cpu")
-    assert (again.revivals, again.revived_at) == (1, 48)
+    assert (again.revivals, again.revived_at) == (1, 24)
 
 
 @pytest.mark.parametrize("deaths", [1, 5])
@@ -209,7 +210,7 @@ def test_a_run_continues_with_another_network(tmp_path, monkeypatch, deaths):
         return judge(state, settings)
 
     monkeypatch.setattr(collapse, "has_dead_network", judged)
-    run = reconstruct(recording(frames=12)[0], tmp_path / "run", wanted)
+    run = reconstruct(recording(frames=8)[0], tmp_path / "run", wanted)
     log = (run.path / "run.log").read_text()
     assert log.count("it is reinitialised") == min(deaths, wanted.restarts_max)
     assert ("reinitialised too often" in log) == (deaths > wanted.restarts_max)
