@@ -279,7 +279,7 @@ def test_a_window_leaves_nothing_in_memory(folder, tmp_path):
     gc.collect()
     gc.disable()
     try:
-        START(folder, tmp_path / "run", progress=count)
+        START(folder, tmp_path / "run", images=4, progress=count)
     finally:
         gc.enable()
     assert len(alive) == 3

@@ -182,9 +182,9 @@ def test_in_half_precision_every_gradient_is_right_to_a_thousandth(device, scale
     That is no mistake of the gradient: among equals it is right to 1e-3. If gradients of Gaussians
     point the same way, the rest cancels.
     """
-    made, gaussians = network(half()).to(device), positions(400).map(lambda value: value.to(device))
-    for offset, difference in ((0.0, 2e-2), (0.5, 8e-2)):
-        cotangent = (scale * (random(3, 400, 3, seed=5) - offset)).to(device)
+    made, gaussians = network(half()).to(device), positions(200).map(lambda value: value.to(device))
+    for offset, difference in ((0.0, 3e-2), (0.5, 8e-2)):
+        cotangent = (scale * (random(3, 200, 3, seed=5) - offset)).to(device)
         found, got = gradients(made, gaussians, cotangent, [0, 1, 3])
         want, wanted = exact(made, gaussians, cotangent, [0, 1, 3])
         assert found.dtype == torch.float32
@@ -202,9 +202,9 @@ def test_sums_over_many_gaussians_are_no_halves(device):
     """What pulls all of them the same way is 10^5 in scaled units, beyond the largest half."""
     made, gaussians = (
         network(half()).to(device),
-        positions(2000).map(lambda value: value.to(device)),
+        positions(1400).map(lambda value: value.to(device)),
     )
-    cotangent = torch.ones(2, 2000, 3, device=device)
+    cotangent = torch.ones(2, 1400, 3, device=device)
     _, got = gradients(made, gaussians, cotangent, [0, 2])
     _, wanted = exact(made, gaussians, cotangent, [0, 2])
     assert 64 * wanted[-2].abs().max() > 1.5 * torch.finfo(torch.float16).max
@@ -225,13 +225,13 @@ def test_the_first_steps_have_gradients_too():
 @pytest.mark.parametrize("device", DEVICES)
 def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     """A field that turns by decimetres, learnt in float32, asked in half precision."""
-    made, gaussians = network(MotionSettings(), head=1e-2), positions(256)
+    made, gaussians = network(MotionSettings(), head=1e-2), positions(128)
     made, gaussians = made.to(device), gaussians.map(lambda value: value.to(device))
     place, keys = made.bind(gaussians), [0, 1, 2, 3]
     turn = torch.linspace(0, 1, len(keys), device=device)[:, None, None]
     target = 0.3 * turn * torch.sin(1.5 * gaussians.mean.roll(1, dims=1) + turn)
     adam = torch.optim.Adam(made.parameters(), lr=1e-3)
-    for _ in range(40):
+    for _ in range(25):
         adam.zero_grad()
         loss = (made.at_keys(place, keys).offset - target).square().mean()
         loss.backward()
