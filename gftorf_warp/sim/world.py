@@ -290,18 +290,17 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
     """First hit of every pixel's centre ray with ``bodies`` at ``time`` [s], in float64."""
     shape, centre = (camera.height, camera.width), camera.centre
     poses = [candidate.path.world_from_body(time) for candidate in bodies]
-    ray, distance, body, face = _nearest(bodies, poses, camera)
-    normal, reflectance = np.full((len(ray), 3), np.nan), np.zeros(len(ray))
-    amplitude = np.zeros(len(ray))
-    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
-        hit = np.flatnonzero(body == index)
-        rotation, reached = pose[:3, :3], distance[hit, None]
-        point = rotation.T @ (centre - pose[:3, 3]) + (ray[hit] @ rotation) * reached
-        normal[hit] = candidate.shape.normal(point, face[hit]) @ rotation.T
-        reflectance[hit] = candidate.texture(point)
-        cosine = np.abs((normal[hit] * ray[hit]).sum(1))
-        amplitude[hit] = reflectance[hit] * candidate.texture.shading(cosine) / distance[hit] ** 2
-    distance = np.where(body < 0, np.nan, distance)
+    ray = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3)
+    distance, body = np.full(len(ray), np.inf), np.full(len(ray), -1)
+    face, normal = np.zeros(len(ray), dtype=np.int64), np.full((len(ray), 3), np.nan)
+    reflectance, amplitude = np.zeros(len(ray)), np.zeros(len(ray))
+    for start in range(0, len(ray), CHUNK):
+        part = slice(start, start + CHUNK)
+        nearest = distance[part], body[part], face[part]
+        _nearest(bodies, poses, centre, ray[part], *nearest)
+        surface = normal[part], reflectance[part], amplitude[part]
+        _surface(bodies, poses, centre, ray[part], *nearest, *surface)
+    distance[body < 0] = np.nan
     return Hits(
         distance=distance.reshape(shape),
         body=body.reshape(shape),
@@ -314,24 +313,51 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
 
 
 def _nearest(
-    bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera
-) -> tuple[np.ndarray, ...]:
-    """Every pixel's ray, the distance [m] of its first hit, the body, -1 for none, and its face."""
-    ray, centre = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3), camera.centre
-    distance = np.full(len(ray), np.inf)
-    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
-    for start in range(0, len(ray), CHUNK):
-        part = slice(start, start + CHUNK)
-        for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
-            rays = start + rays_to_ball(centre, ray[part], pose[:3, 3], candidate.shape.reach)
-            if len(rays) == 0:
-                continue
-            origin = pose[:3, :3].T @ (centre - pose[:3, 3])
-            reached, side = candidate.shape.hit(origin, ray[rays] @ pose[:3, :3])
-            nearer = reached < distance[rays]
-            chosen = rays[nearer]
-            distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
-    return ray, distance, body, face
+    bodies: tuple[Body, ...],
+    poses: list[np.ndarray],
+    centre: np.ndarray,
+    ray: np.ndarray,
+    distance: np.ndarray,
+    body: np.ndarray,
+    face: np.ndarray,
+) -> None:
+    """Write the distance [m] of every ray's first hit, the body and its face."""
+    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
+        rays = rays_to_ball(centre, ray, pose[:3, 3], candidate.shape.reach)
+        if len(rays) == 0:
+            continue
+        own = ray if len(rays) == len(ray) else ray.take(rays, axis=0)
+        origin = pose[:3, :3].T @ (centre - pose[:3, 3])
+        reached, side = candidate.shape.hit(origin, own @ pose[:3, :3])
+        nearer = np.flatnonzero(reached < distance[rays])
+        chosen = rays[nearer]
+        distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
+
+
+def _surface(
+    bodies: tuple[Body, ...],
+    poses: list[np.ndarray],
+    centre: np.ndarray,
+    ray: np.ndarray,
+    distance: np.ndarray,
+    body: np.ndarray,
+    face: np.ndarray,
+    normal: np.ndarray,
+    reflectance: np.ndarray,
+    amplitude: np.ndarray,
+) -> None:
+    """Write normal, reflectance and amplitude where a ray hits a body."""
+    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
+        hit = np.flatnonzero(body == index)
+        if len(hit) == 0:
+            continue
+        rotation, own, reached = pose[:3, :3], ray.take(hit, axis=0), distance[hit]
+        point = rotation.T @ (centre - pose[:3, 3]) + (own @ rotation) * reached[:, None]
+        upright = candidate.shape.normal(point, face[hit]) @ rotation.T
+        x, y, z = (upright * own).T
+        rho, cosine = candidate.texture(point), np.abs(x + y + z)
+        normal[hit], reflectance[hit] = upright, rho
+        amplitude[hit] = rho * candidate.texture.shading(cosine) / reached**2
 
 
 def rays_to_ball(
