@@ -31,7 +31,7 @@ static void count_block(wp::array_t<float> gradient, int count, int block,
 static void list_block(wp::array_t<float> gradient, wp::array_t<int> counts, int count, int block,
                        wp::array_t<int> listed, wp::array_t<int> begins) { CODE }
 int main(int, char** given) {
-    const int keys = std::stoi(given[1]), count = std::stoi(given[2]);
+    const int keys = std::atoi(given[1]), count = std::atoi(given[2]);
     auto gradient = loaded<float>("gradient");
     const int blocks = keys * ((count + 255) / 256);
     std::vector<int> counts(blocks, -9), listed(keys * ((count + 63) / 64) * 64, -9),
@@ -49,9 +49,9 @@ static void multiply(int block, int jobs, int parts, int keys, int count, int ca
                      wp::array_t<int> listed, wp::array_t<int> begins, wp::array_t<wp::half> slopes,
                      wp::array_t<wp::half> inputs, wp::array_t<float> partials) { CODE }
 int main(int, char** given) {
-    const int jobs = std::stoi(given[1]), parts = std::stoi(given[2]), keys = std::stoi(given[3]);
-    const int count = std::stoi(given[4]), joined = std::stoi(given[5]), columns =
-        std::stoi(given[6]);
+    const int jobs = std::atoi(given[1]), parts = std::atoi(given[2]), keys = std::atoi(given[3]);
+    const int count = std::atoi(given[4]), joined = std::atoi(given[5]), columns =
+        std::atoi(given[6]);
     auto listed = loaded<int>("listed"), begins = loaded<int>("starts");
     // copies of 16 bytes are aligned as they are in the memory of a device
     auto aligned = [](const std::vector<wp::half>& from) {
@@ -75,7 +75,7 @@ static void multiply(int part, int parts, int keys, int layers, int rows, wp::ar
                          wp::array_t<wp::half> outputs,
                      wp::array_t<float> partials) { CODE }
 int main(int, char** given) {
-    const int parts = std::stoi(given[1]), keys = std::stoi(given[2]), layers = std::stoi(given[3]);
+    const int parts = std::atoi(given[1]), keys = std::atoi(given[2]), layers = std::atoi(given[3]);
     auto listed = loaded<int>("listed"), begins = loaded<int>("starts");
     auto after = loaded<wp::half>("after"), outputs = loaded<wp::half>("outputs");
     std::vector<float> partials((size_t)parts * 768, NAN);
@@ -199,7 +199,7 @@ def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tm
 
 @BY_THREADS
 @pytest.mark.parametrize("columns", [WIDTH, wgmma.COLUMNS])
-@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (2, 600, 1), (1, 40, 2)])
+@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (2, 250, 1), (1, 40, 2)])
 def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_path):
     """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T
     h in float64.
@@ -285,11 +285,11 @@ def test_the_heads_weight_by_blocks_of_threads(keys, count, parts, tmp_path):
 def test_nobody_reads_rows_that_are_not_listed(shape, device):
     """Whatever is in them, in the last layer as well: the same weight gradients, to the bit."""
     made, _ = pair(SHAPES[shape], device)
-    form, place, moment, all_weights, biases = inputs_of(made, 70, 3)
+    form, place, moment, all_weights, biases = inputs_of(made, 40, 2)
     passes = FusedLayers()
-    gradient = hidden(random(210, 3, seed=3) - 0.5, 0.6, 3).to(device)
+    gradient = hidden(random(80, 3, seed=3) - 0.5, 0.6, 2).to(device)
     outputs, _, kept = passes.forward(form, place, moment, all_weights, biases)
-    slopes = passes.backward(form, 3, gradient, outputs, kept)
+    slopes = passes.backward(form, 2, gradient, outputs, kept)
     want = passes.parameter_gradients(form, place, moment, slopes, outputs)
     outputs[:, (gradient == 0).all(1)] = torch.inf
     found = passes.parameter_gradients(form, place, moment, slopes, outputs)
@@ -380,20 +380,19 @@ def test_shared_memory_is_enough():
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("share", [0.0, 0.6])
-def test_gradients_are_those_of_all_rows(shape, share, device):
+def test_gradients_are_those_of_all_rows(shape, device):
     """Rows without gradient add nothing: alone, the others give the same gradients,
     up to the order of their sums.
     """
     made, _ = pair(SHAPES[shape], device)
-    gaussians, cotangent = rows(70, 3, device)
-    drawn = hidden(cotangent[0], share, 1)  # the same Gaussians at all keys
+    gaussians, cotangent = rows(70, 2, device)
+    drawn = hidden(cotangent[0], 0.6, 1)  # the same Gaussians at both keys
     cotangent = cotangent * (drawn != 0).any(1, keepdim=True)
     left = (cotangent != 0).any(2).all(0)
     alone = gaussians.map(lambda value: value[left])
-    _, got = gradients(made, gaussians, cotangent, [0, 1, 3])
-    _, want = gradients(made, alone, cotangent[:, left], [0, 1, 3])
-    assert (left.sum() < 70) == (share > 0)
+    _, got = gradients(made, gaussians, cotangent, [0, 3])
+    _, want = gradients(made, alone, cotangent[:, left], [0, 3])
+    assert 0 < left.sum() < 70
     for one, other in zip(got, want, strict=True):
         assert other.abs().max() > 1e-4
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4 * float(other.abs().max()))
