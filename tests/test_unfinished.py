@@ -2,6 +2,7 @@
 and are never read as sequences.
 """
 
+import json
 import os
 import shutil
 import signal
@@ -21,9 +22,23 @@ from gftorf_warp.sim.resume import partial_of
 from gftorf_warp.sim.simulate import simulate
 
 OPTIONS = {"size": (24, 18), "frames": 8, "seed": 3}
-# in a shell's background job SIGINT is ignored, and children inherit that
-HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-COMMAND = HEARS + "import sys; from gftorf_warp.cli import main; sys.exit(main())"
+# Commands in processes of their own, forked after what they import. In a shell's background job
+# SIGINT is ignored, and children inherit that.
+COMMANDS = """
+import json, os, signal, sys
+from gftorf_warp.cli import main
+from gftorf_warp.sim import simulate
+for line in sys.stdin:
+    words, errors = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT), 2)
+        os.dup2(2, 1)
+        sys.exit(main(words))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 
 
 def contents(folder):
@@ -198,34 +213,44 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_made(tmp_
 def undisturbed(tmp_path_factory):
     """What nobody stopped."""
     return simulate(
-        "demo", tmp_path_factory.mktemp("undisturbed") / "seq", size=(96, 72), frames=16
+        "demo", tmp_path_factory.mktemp("undisturbed") / "seq", size=(64, 48), frames=16
     )
+
+
+@pytest.fixture(scope="module")
+def commands():
+    """Starts commands: two lines, words and file of messages, to process id and exit code."""
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMANDS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield process
 
 
 @pytest.mark.parametrize(
     "kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name
 )
-def test_a_signal_loses_no_finished_frame(tmp_path, kind, undisturbed):
+def test_a_signal_loses_no_finished_frame(tmp_path, kind, undisturbed, commands):
     """The command line, stopped in the middle however hard,
     goes on and gives the bytes of one that was not.
     """
-    command = ["simulate", "demo", "--size", "96x72", "--frames", "16", "--out"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *command, str(tmp_path / "seq")], stderr=subprocess.PIPE
-    )
+    words = ["simulate", "demo", "--size", "64x48", "--frames", "16", "--out"]
+    errors = tmp_path / "errors.txt"
+    line = json.dumps([[*words, str(tmp_path / "seq")], str(errors)])
+    print(line, file=commands.stdin, flush=True)
+    process = int(commands.stdout.readline())
     folder = partial_of(tmp_path / "seq")
-    while len(list(folder.glob("*.npz")) if folder.exists() else []) < 3 and process.poll() is None:
+    while len(list(folder.glob("*.npz")) if folder.exists() else []) < 3:
+        os.kill(process, 0)  # an error if it has ended
         time.sleep(0.005)
-    process.send_signal(kind)
-    _, err = process.communicate(timeout=60)
+    os.kill(process, kind)
     codes = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
-    assert process.returncode == codes[kind]
-    assert kind == signal.SIGKILL or b"the same command resumes it" in err
+    assert int(commands.stdout.readline()) == codes[kind]
+    assert kind == signal.SIGKILL or "the same command resumes it" in errors.read_text()
     kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
     assert 3 <= len(kept) < 16, "the signal came too late to be a test"
     done = []
     simulate(
-        "demo", tmp_path / "seq", size=(96, 72), frames=16, progress=lambda n, _: done.append(n)
+        "demo", tmp_path / "seq", size=(64, 48), frames=16, progress=lambda n, _: done.append(n)
     )
     assert len(done) == 16 - len(kept)
     assert contents(tmp_path / "seq") == contents(undisturbed)
