@@ -17,7 +17,7 @@ from gftorf_warp.sim.settings import SimSettings
 from gftorf_warp.sim.simulate import simulate, simulate_ladder
 
 SETTINGS = SimSettings(paths=9)
-SMALL = {"size": (32, 24), "frames": 16}
+SMALL = {"size": (24, 18), "frames": 16}
 
 
 def test_each_level_is_the_one_before_and_more():
@@ -115,7 +115,7 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
     """Nothing is wrong at one instant; asynchrony, noise and bounces each cost what they must,
     where they must.
     """
-    rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL, paths=64))
+    rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL, paths=32))
     assert [*rows] == [*NAMES]
     assert rows["sync"].all < 1e-6
     assert rows["L0"].moving > 20
@@ -132,7 +132,7 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
         assert line in text
     assert f"{rows['L3'].all - rows['L2'].all:.4g}" in text
     card = (tmp_path / "ladder" / "L2" / "README.md").read_text()
-    assert "gftorf simulate demo --out SEQ --frames 16 --size 32x24 --seed 0 --level L2" in card
+    assert "gftorf simulate demo --out SEQ --frames 16 --size 24x18 --seed 0 --level L2" in card
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "ladder").rglob("*.npy")}
     simulate("demo", tmp_path / "ladder" / "L2", **SMALL, level="L2")
     code = main(
@@ -141,11 +141,11 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
             "demo",
             "--ladder",
             "--size",
-            "32x24",
+            "24x18",
             "--frames",
             "16",
             "--paths",
-            "64",
+            "32",
             "-q",
             "--out",
             str(tmp_path / "ladder"),

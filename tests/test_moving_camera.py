@@ -71,6 +71,12 @@ def flat(scene, camera, time, pixels=2):
     return mask, hit
 
 
+@pytest.fixture(scope="module")
+def recorded():
+    """Two quartets of the scene, with colour."""
+    return record(carried(), frames=8)
+
+
 # -- poses -----------------------------------------------------------------------------------------
 
 
@@ -143,12 +149,11 @@ def test_every_raw_frame_has_the_pose_of_its_own_time(sync):
         assert np.abs(np.diff(step)).max() < 4e-3 < step.max() < 0.1
 
 
-def test_truth_is_seen_from_the_pose_of_its_frame():
+def test_truth_is_seen_from_the_pose_of_its_frame(recorded):
     """Each frame's distance is that of its own camera, and no other frame's:
     the quads show the same.
     """
-    scene = carried(colour=None)
-    recording = record(scene, frames=8)
+    scene, recording = carried(), recorded
     sensor = scene.sensor
     for n, time in enumerate(recording.sequence.times):
         mask, hit = flat(scene, camera_of(recording.sequence, n), float(time))
@@ -162,7 +167,7 @@ def test_truth_is_seen_from_the_pose_of_its_frame():
 # -- what moves, moves the closed form -------------------------------------------------------------
 
 
-def test_a_still_scene_decodes_from_a_moving_camera_only_if_a_quartet_is_taken_at_once():
+def test_a_still_scene_decodes_from_a_moving_camera_only_if_a_quartet_is_taken_at_once(recorded):
     """With ``sync`` the closed form is right but for outlines; without,
     wrong where the camera's motion shows.
     """
@@ -174,10 +179,12 @@ def test_a_still_scene_decodes_from_a_moving_camera_only_if_a_quartet_is_taken_a
         path=Still(position=(0, 0, 3.0)),
     )
     ahead = carried(camera_path=axial, bodies=(wall,), colour=None)
-    for scene, wrong in ((carried(colour=None), 0.005), (ahead, 0.02)):
+    still = carried(colour=None)
+    at_once = [record(scene, frames=8, sync=True) for scene in (still, ahead)]
+    in_turn = [recorded, record(ahead, frames=8)]
+    for k, (scene, wrong) in enumerate(((still, 0.005), (ahead, 0.02))):
         errors = {}
-        for sync in (True, False):
-            recording = record(scene, frames=8, sync=sync)
+        for sync, recording in ((True, at_once[k]), (False, in_turn[k])):
             mask, _ = flat(
                 scene, camera_of(recording.sequence, 4), float(recording.sequence.times[4])
             )
@@ -312,12 +319,11 @@ def test_the_colour_camera_sits_where_it_is_put():
     np.testing.assert_allclose(axes, rotation_matrix(COLOUR.turn_deg), atol=1e-12)
 
 
-def test_two_cameras_see_the_same_point():
+def test_two_cameras_see_the_same_point(recorded):
     """The true point of a ToF pixel, projected into the colour image, has its albedo there;
     without baseline not.
     """
-    scene = carried()
-    recording = record(scene, frames=8)
+    scene, recording = carried(), recorded
     sequence = recording.sequence
     n, tof = 4, camera_of(recording.sequence, 4)
     mask, hit = flat(scene, tof, float(sequence.times[n]))
@@ -431,11 +437,17 @@ def test_tour_is_what_it_says():
         assert 0.8 < distance.min() < distance.max() < 0.8 * scene.sensor.unambiguous_range
 
 
+@pytest.fixture(scope="module")
+def tour():
+    """Two quartets of it."""
+    return record(SCENES["tour"], frames=8, size=SIZE, seed=2)
+
+
 @pytest.mark.parametrize("layout", ["ftorf", "torf"])
-def test_tour_is_read_back(tmp_path, layout):
+def test_tour_is_read_back(tour, tmp_path, layout):
     """Quads or phasors, times, poses, truth and colour of the folder are those of the recording."""
     path = simulate("tour", tmp_path / "seq", frames=8, size=SIZE, seed=2, format=layout)
-    want = record(SCENES["tour"], frames=8, size=SIZE, seed=2)
+    want = tour
     got, truth = Sequence.open(path), Sequence.open(path).truth()
     frames = np.arange(8) if layout == "ftorf" else np.repeat([0, 4], 4)
     assert got.from_phasors == (layout == "torf")
@@ -474,6 +486,7 @@ def test_a_layout_is_part_of_the_settings(tmp_path):
             carried(),
             tmp_path / "seq",
             frames=4,
+            size=SIZE,
             format=layout,
             progress=lambda *n: calls.append(n),
             **more,

@@ -178,9 +178,8 @@ def test_the_canary_sings(tmp_path):
     rendering.
     """
     canary, options = benchmark("canary"), {"images": 300, "device": "cpu"}
-    sequence = simulate(
-        "demo", tmp_path / "rays", size=(48, 36), noise=False, **canary.ROWS[canary.SOURCE]
-    )
+    small = {"size": (32, 24), "frames": 16, "noise": False}
+    sequence = simulate("demo", tmp_path / "rays", **small, **canary.ROWS[canary.SOURCE])
     run = reconstruct(sequence, tmp_path / "run", canary.PRESET, **options)
     own = canary.own_model(run, tmp_path / "own")
     again = reconstruct(own, tmp_path / "again", canary.PRESET, **options)
