@@ -104,28 +104,34 @@ def changed(before, after):
     return (np.abs(after - before).max(axis=2) > 30).mean()
 
 
+@pytest.fixture(scope="module")
+def tab():
+    """One browser for both sizes."""
+    with browser() as one:
+        yield one
+
+
 @pytest.mark.parametrize("size", [(480, 400), PHONE], ids=["desktop", "phone"])
-def test_a_browser_shows_splats_that_move(run, tmp_path, size):
+def test_a_browser_shows_splats_that_move(run, tab, tmp_path, size):
     """Colours where Gaussians are; other pixels after the slider moved, and after a turn."""
     (page,) = export(run, tmp_path / "out", "html")
-    with browser() as tab:
-        tab.resize(size)
-        tab.open(page.as_uri())
-        first = splats_of(tab)
-        assert np.ptp(first.reshape(-1, 3), axis=0).min() > 60, "splats have colours"
-        assert tab.value("document.body.scrollWidth") <= size[0]
-        tab.value("element('time').focus()")
-        for _ in range(6):
-            tab.press("ArrowRight")
-        assert "raw frame 6" in tab.value("element('now').textContent")
-        later = splats_of(tab)
-        assert 0.02 < changed(first, later) < 0.9
-        at = {"x": size[0] // 2, "y": 150, "button": "left", "buttons": 1}
-        for kind, x in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
-            tab.send("Input.dispatchMouseEvent", type=kind, **at | {"x": at["x"] + x})
-        assert changed(later, splats_of(tab)) > 0.02
-        tab.value("location.hash = '#0'")
-        tab.until("moment === 0")
-        tab.value("element('reset').click()")
-        assert changed(first, splats_of(tab)) < 0.001
-        assert not tab.problems
+    tab.resize(size)
+    tab.open(page.as_uri())
+    first = splats_of(tab)
+    assert np.ptp(first.reshape(-1, 3), axis=0).min() > 60, "splats have colours"
+    assert tab.value("document.body.scrollWidth") <= size[0]
+    tab.value("element('time').focus()")
+    for _ in range(6):
+        tab.press("ArrowRight")
+    assert "raw frame 6" in tab.value("element('now').textContent")
+    later = splats_of(tab)
+    assert 0.02 < changed(first, later) < 0.9
+    at = {"x": size[0] // 2, "y": 150, "button": "left", "buttons": 1}
+    for kind, x in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
+        tab.send("Input.dispatchMouseEvent", type=kind, **at | {"x": at["x"] + x})
+    assert changed(later, splats_of(tab)) > 0.02
+    tab.value("location.hash = '#0'")
+    tab.until("moment === 0")
+    tab.value("element('reset').click()")
+    assert changed(first, splats_of(tab)) < 0.001
+    assert not tab.problems

@@ -108,8 +108,15 @@ function shows(colour) {{
 </script>"""
 
 
+@pytest.fixture(scope="module")
+def tab():
+    """One browser for both kinds."""
+    with browser() as one:
+        yield one
+
+
 @pytest.mark.parametrize("kind", ["webm", "mp4"])
-def test_a_video_plays_in_a_browser(tmp_path, kind):
+def test_a_video_plays_in_a_browser(tab, tmp_path, kind):
     """Chromium decodes it, has its size and length, and shows the picture of each time; it plays
     until its end.
     """
@@ -118,18 +125,17 @@ def test_a_video_plays_in_a_browser(tmp_path, kind):
     video.write_video(tmp_path / f"film.{kind}", film, len(film), rate_hz=4.0)
     data = base64.b64encode((tmp_path / f"film.{kind}").read_bytes()).decode()
     (tmp_path / "player.html").write_text(PLAYER.format(kind=kind, data=data))
-    with browser() as tab:
-        tab.open((tmp_path / "player.html").as_uri())
-        tab.until("video.readyState >= 2")
-        assert tab.value("[video.videoWidth, video.videoHeight]") == [64, 48]
-        assert tab.value("video.duration") == pytest.approx(0.75, abs=0.02)
-        for k, colour in enumerate(colours):
-            tab.value(f"video.currentTime = {(k + 0.5) / 4}")
-            # OpenCV states no matrix for its YUV, and Chromium takes another one: 27 away here
-            tab.until(f"shows({colour.tolist()})")  # "seeked" may come before the picture
-        tab.value("video.play()")
-        tab.until("video.ended")
-        assert tab.problems == []
+    tab.open((tmp_path / "player.html").as_uri())
+    tab.until("video.readyState >= 2")
+    assert tab.value("[video.videoWidth, video.videoHeight]") == [64, 48]
+    assert tab.value("video.duration") == pytest.approx(0.75, abs=0.02)
+    for k, colour in enumerate(colours):
+        tab.value(f"video.currentTime = {(k + 0.5) / 4}")
+        # OpenCV states no matrix for its YUV, and Chromium takes another one: 27 away here
+        tab.until(f"shows({colour.tolist()})")  # "seeked" may come before the picture
+    tab.value("video.play()")
+    tab.until("video.ended")
+    assert tab.problems == []
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
