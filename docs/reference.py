@@ -191,14 +191,19 @@ def raised_errors() -> Iterator[tuple[str, str, str, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         place = path.relative_to(PACKAGE).parts
         area = place[0] if len(place) > 1 else "command line"
-        for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(function, ast.FunctionDef):
-                assignments = list(assigned(function))
-                for call in ast.walk(function):
-                    if isinstance(call, ast.Call) and getattr(call.func, "id", "") in kinds:
-                        row = error_row(call, assignments)
-                        if all(text.strip("…: ") for text in (row[0], row[1] + row[2])):
-                            yield area, *row
+        source = path.read_text(encoding="utf-8")
+        if not any(f"{kind}(" in source for kind in kinds):
+            continue
+        for function in ast.walk(ast.parse(source)):
+            if not isinstance(function, ast.FunctionDef):
+                continue
+            calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+            calls = [call for call in calls if getattr(call.func, "id", "") in kinds]
+            assignments = list(assigned(function)) if calls else []
+            for call in calls:
+                row = error_row(call, assignments)
+                if all(text.strip("…: ") for text in (row[0], row[1] + row[2])):
+                    yield area, *row
 
 
 def error_row(call: ast.Call, assignments: list[tuple[str, ast.expr]]) -> tuple[str, str, str]:

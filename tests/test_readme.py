@@ -35,10 +35,10 @@ def test_a_simulation_of_the_pages_runs(line, tmp_path, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
     words = shlex.split(line)[1:]
     words[words.index("--out") + 1] = out = str(tmp_path / "seq")
-    assert cli.main([*words, "--size", "24x18", "--frames", "8", "-q"]) == 0
+    assert cli.main([*words, "--size", "16x12", "--frames", "8", "-q"]) == 0
     folder = Path(out) / NAMES[-1] if "--ladder" in words else Path(out)
     sequence = Sequence.open(folder)
-    assert sequence.quads.shape == (8, 18, 24)
+    assert sequence.quads.shape == (8, 12, 16)
     assert sequence.truth() is not None
     assert (folder / "contact_sheet.png").is_file()
     if "--truth" in words:
