@@ -71,24 +71,35 @@ def test_few_images_or_cpus_are_left_to_threads(monkeypatch):
     assert processes.useful(10_000) == 0
 
 
+def written(run, out):
+    """Files of all images of a run, and its progress."""
+    seen = []
+    folder = render_to_folder(run, out, ALL, progress=lambda *done: seen.append(done))
+    return files_in(folder), seen
+
+
+@pytest.fixture(scope="module")
+def by_threads(tmp_path_factory):
+    """A run, and what threads write of it."""
+    folder = tmp_path_factory.mktemp("threads")
+    run = AnalyticRun(folder, colour=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(processes, "useful", lambda _: 0)
+        return run, written(run, folder / "out")
+
+
 @needs_memory
 @pytest.mark.parametrize(("count", "block", "limit"), [(1, 4, 1 << 23), (3, 5, 1 << 23), (2, 4, 1)])
-def test_processes_write_what_threads_do(analytic, tmp_path, monkeypatch, count, block, limit):
+def test_processes_write_what_threads_do(by_threads, tmp_path, monkeypatch, count, block, limit):
     """Byte by byte, of messages that the images fill or do not; progress counts up."""
     monkeypatch.setattr(processes, "BLOCK", block)
     monkeypatch.setattr(processes, "BLOCK_BYTES", limit)
-    seen, found = [], {}
-    for number in (0, count):
-        monkeypatch.setattr(
-            processes, "useful", lambda total, n=number: n if total == FRAMES else 0
-        )
-        out = render_to_folder(
-            analytic, tmp_path / str(number), ALL, progress=lambda *done: seen.append(done)
-        )
-        found[number] = files_in(out)
-    assert found[0] == found[count]
-    assert len(found[0]) == 1 + 2 * len(ALL) * FRAMES
-    assert seen == 2 * [(k + 1, FRAMES) for k in range(FRAMES)]
+    monkeypatch.setattr(processes, "useful", lambda total: count if total == FRAMES else 0)
+    run, want = by_threads
+    files, seen = written(run, tmp_path / "out")
+    assert (files, seen) == want
+    assert len(files) == 1 + 2 * len(ALL) * FRAMES
+    assert seen == [(k + 1, FRAMES) for k in range(FRAMES)]
     assert not open_memory(os.getpid())
 
 
