@@ -142,6 +142,6 @@ def test_names_of_random_scenes(capsys):
         scene_of("random-x")
     with pytest.raises(ValueError, match="0 or more, got -1"):
         random_scene(-1)
-    small = [word for value in ("width=32", "height=24", "frames=8") for word in ("--override", value)]
+    small = [f"--override={value}" for value in ("width=32", "height=24", "frames=8")]
     assert cli.main(["simulate", "random", "--seed", "7", "--list", *small]) == 0
     assert random_scene(7).motion in capsys.readouterr().out
