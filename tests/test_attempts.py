@@ -42,6 +42,22 @@ def sequence(tmp_path_factory):
     return write("capture", tmp_path_factory.mktemp("attempts") / "sequence", *recording(frames=12))
 
 
+@pytest.fixture(scope="module")
+def single(tmp_path_factory, sequence):
+    """A run of one attempt."""
+    folder = tmp_path_factory.mktemp("single")
+    return reconstruct(sequence, folder / "run", settings(attempts_max=1))
+
+
+@pytest.fixture(scope="module")
+def failed_twice(tmp_path_factory, sequence):
+    """A run whose starts are both broken."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attempts, "JUDGED_FROM", 0)
+        break_starts(patch, injected.veil, count=2)
+        return reconstruct(sequence, tmp_path_factory.mktemp("failed") / "run", settings())
+
+
 @pytest.fixture(autouse=True)
 def judged(monkeypatch):
     """Short runs are judged too."""
@@ -97,9 +113,8 @@ def test_a_failed_start_is_followed_by_another_one(tmp_path, monkeypatch, sequen
     assert found < closed
 
 
-def test_the_better_attempt_stays(tmp_path, monkeypatch, sequence):
+def test_the_better_attempt_stays(tmp_path, monkeypatch, sequence, single):
     """Where the second one is worse, everything of the first one is there again."""
-    alone = reconstruct(sequence, tmp_path / "alone", settings(attempts_max=1))
     monkeypatch.setattr(attempts, "failures", lambda _: ["as a test"])
     kinds = []
 
@@ -115,17 +130,17 @@ def test_the_better_attempt_stays(tmp_path, monkeypatch, sequence):
     assert kinds == [Init.QUARTETS, Init.PHASE]
     assert [one["kept"] for one in run.config["attempts"]] == [True, False]
     assert isinstance(run.motion, Windows)
-    assert rows(run.path) == rows(alone.path)
-    ours, other = stored(run.path), stored(alone.path)
+    assert rows(run.path) == rows(single.path)
+    ours, other = stored(run.path), stored(single.path)
     assert len(ours.pop("judged")) == 2
     assert other.pop("judged") == []
     assert same(ours, other)
 
 
-def test_an_interrupted_run_goes_on_with_its_attempt(tmp_path, monkeypatch, sequence):
+def test_an_interrupted_run_goes_on_with_its_attempt(
+    tmp_path, monkeypatch, sequence, failed_twice
+):
     """Stopped in the second attempt, it ends in the bytes of an uninterrupted one."""
-    break_starts(monkeypatch, injected.veil, count=9)
-    whole = reconstruct(sequence, tmp_path / "whole", settings())
     seen = []
 
     def stop(images, *_, **__):
@@ -139,8 +154,8 @@ def test_an_interrupted_run_goes_on_with_its_attempt(tmp_path, monkeypatch, sequ
     assert stored(tmp_path / "parts")["attempt"] == 2
     parts = reconstruct(sequence, tmp_path / "parts", settings())
     assert len(parts.config["attempts"]) == 2
-    assert same(stored(whole.path), stored(parts.path))
-    assert rows(whole.path) == rows(parts.path)
+    assert same(stored(failed_twice.path), stored(parts.path))
+    assert rows(failed_twice.path) == rows(parts.path)
 
 
 def test_a_run_that_was_killed_before_its_judgement_is_judged(tmp_path, monkeypatch, sequence):
@@ -167,25 +182,23 @@ def test_a_run_that_was_killed_before_its_judgement_is_judged(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("change", [injected.nan_flow, injected.turned_flow])
-def test_best_needs_no_right_flow(tmp_path, sequence, change):
+def test_best_needs_no_right_flow(tmp_path, single, change):
     """Of wrong or unknown flow the start takes nothing: translations explain the quads better. So
     the fit explains nearly as many pixels as with the right flow.
     """
-    right = reconstruct(sequence, tmp_path / "right", settings(attempts_max=1))
     folder = write(
         "capture", tmp_path / "sequence", change(recording(frames=12)[0]), recording(frames=12)[1]
     )
     run = reconstruct(folder, tmp_path / "run", settings(attempts_max=1))
-    shares = [one.config["explained"]["unexplained_share"] for one in (right, run)]
+    shares = [one.config["explained"]["unexplained_share"] for one in (single, run)]
     assert shares[1] < shares[0] + 0.05
-    (known, closed), (found, _) = error(right), error(run)
+    (known, closed), (found, _) = error(single), error(run)
     assert found < min(1.1 * known, closed)
 
 
-def test_both_attempts_may_fail(tmp_path, monkeypatch, sequence):
+def test_both_attempts_may_fail(failed_twice):
     """Then the log says so, and the measurement replaces the fit."""
-    break_starts(monkeypatch, injected.veil, count=2)
-    run = reconstruct(sequence, tmp_path / "run", settings())
+    run = failed_twice
     assert len(run.config["attempts"]) == 2
     assert failures(run.config["explained"])
     assert "does not explain" in (run.path / "run.log").read_text().split("stays")[-1]
