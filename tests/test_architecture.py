@@ -3,6 +3,7 @@ enforced on the source text.
 """
 
 import ast
+import functools
 import importlib
 import inspect
 import re
@@ -130,10 +131,23 @@ def room_of(path):
     return path.relative_to(ROOT).parts[0]
 
 
-def imports(tree, path):
-    """Yield every absolute dotted name that the statements below ``tree`` import."""
+@functools.cache
+def nodes_of(path):
+    """The syntax tree of a file, and all nodes below."""
+    return [*ast.walk(ast.parse(path.read_text()))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten():
+    """The trees are large: they go with the last test."""
+    yield
+    nodes_of.cache_clear()
+
+
+def imports(nodes, path):
+    """Yield every absolute dotted name that statements import."""
     package = ["gftorf_warp", *path.relative_to(ROOT).parts[:-1]]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (a.name for a in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -141,13 +155,13 @@ def imports(tree, path):
             yield from (".".join([*base, *filter(None, [node.module]), a.name]) for a in node.names)
 
 
-def module_level_imports(tree, path):
+def module_level_imports(path):
     """Yield what is imported as soon as the module is:
     outside functions and outside ``if TYPE_CHECKING``.
     """
-    for node in tree.body:
+    for node in nodes_of(path)[0].body:
         if not isinstance(node, ast.FunctionDef | ast.ClassDef | ast.If):
-            yield from imports(node, path)
+            yield from imports(ast.walk(node), path)
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -155,18 +169,18 @@ def test_module_imports_what_its_room_may(path):
     """No upward import, no package the room does not need,
     nothing heavy before a function needs it.
     """
-    room, tree = room_of(path), ast.parse(path.read_text())
+    room = room_of(path)
     top_level = path.parent == ROOT
     assert room in TABLE or top_level, f"{room}/ is not in the table: say what it may import"
     # cli.py and its like see every room
     rooms, packages = TABLE.get(room, (TABLE.keys(), TORCH | {"warp"}))
-    names = list(imports(tree, path))
+    names = list(imports(nodes_of(path), path))
     for top, *rest in (name.split(".") for name in names):
         if top != "gftorf_warp":
             assert top in packages | set(sys.stdlib_module_names), f"{room} must not import {top}"
         elif rest and not top_level:
             assert rest[0] in {*rooms, room, *FREE}, f"{room} must not import {rest[0]}"
-    for top, *rest in (name.split(".") for name in module_level_imports(tree, path)):
+    for top, *rest in (name.split(".") for name in module_level_imports(path)):
         assert top not in INSIDE_FUNCTIONS, f"import {top} inside the functions that use it"
         if top_level and top == "gftorf_warp" and rest:
             assert rest[0] not in TABLE or rest[0] in FREE, (
@@ -187,7 +201,7 @@ def test_module_names_no_device_and_launches_nowhere_else(path):
     streams likewise.
     """
     name, below = name_of(path), path.parent != ROOT
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path):
         if below:
             named = getattr(node, "attr", None) == "cuda" and name not in KNOWS_STREAMS
             assert not named, f"line {node.lineno}: follow the device of the input"
@@ -225,7 +239,7 @@ def test_everything_public_says_what_it_is(path):
     """Modules, public classes, their public methods and public functions have docstrings;
     so has each setting.
     """
-    tree = ast.parse(path.read_text())
+    tree = nodes_of(path)[0]
     assert ast.get_docstring(tree), "say what the module is"
     for holder in [
         tree,
@@ -254,7 +268,7 @@ def kernels():
     """Yield every @wp.kernel of the package, also those that a factory makes."""
     for path in FILES:
         text = path.read_text()
-        for node in ast.walk(ast.parse(text)) if "@wp.kernel" in text else ():
+        for node in nodes_of(path) if "@wp.kernel" in text else ():
             if isinstance(node, ast.FunctionDef) and any(
                 "kernel" in ast.unparse(d) for d in node.decorator_list
             ):
@@ -305,13 +319,13 @@ def module_of(path):
     )
 
 
-def import_graph(below):
-    """Modules of the package that each module imports in what ``below(tree, path)`` yields."""
+def import_graph():
+    """Modules of the package that each module imports."""
     modules = {module_of(path): path for path in FILES}
     graph = {}
     for module, path in modules.items():
         graph[module] = set()
-        for name in below(ast.parse(path.read_text()), path):
+        for name in imports(nodes_of(path), path):
             parts = name.split(".")  # what is imported may be a name inside a module
             above = {".".join(parts[:n]) for n in range(2, len(parts) + 1)} & modules.keys()
             graph[module] |= {max(above, key=len)} - {module} if above else set()
@@ -353,7 +367,7 @@ def test_no_module_imports_itself_by_a_detour():
     """No circle of imports, be they at the top of a file,
     inside a function or for the type checker alone.
     """
-    found = circles(import_graph(imports))
+    found = circles(import_graph())
     assert not found, f"import circles: {found}"
 
 
@@ -371,7 +385,7 @@ def attributes(node):
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_class_is_small(path):
     """A class has at most 150 lines and 15 attributes; more are several ideas."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path):
         if isinstance(node, ast.ClassDef):
             lines, count = node.end_lineno - node.lineno + 1, len(attributes(node))
             small = lines <= MAX_CLASS_LINES and count <= MAX_ATTRIBUTES
@@ -386,7 +400,7 @@ def test_no_exception_is_kept_for_a_class_that_became_small():
         f"{name_of(path)}:{node.name}": node
         for path in FILES
         if any(name.startswith(f"{name_of(path)}:") for name in LARGE_CLASSES)
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes_of(path)
         if isinstance(node, ast.ClassDef)
     }
     for name in LARGE_CLASSES:
@@ -423,7 +437,7 @@ def device_values():
         if "@wp." not in text:
             continue
         source = text.splitlines()
-        for node in ast.walk(ast.parse(text)):
+        for node in nodes_of(path):
             kinds = "".join(map(ast.unparse, getattr(node, "decorator_list", [])))
             if isinstance(node, ast.FunctionDef) and "kernel" in kinds:
                 values = [(arg.arg, arg.lineno) for arg in node.args.args]
