@@ -174,7 +174,7 @@ def test_gaussians_are_fitted_to_it(folders, name, tmp_path):
     and what moves better than the closed form.
     """
     run = reconstruct(
-        folders / name, tmp_path / "run", "demo", images=240, changes=["schedule.log_every=30"]
+        folders / name, tmp_path / "run", "demo", images=160, changes=["schedule.log_every=20"]
     )
     rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 1.0

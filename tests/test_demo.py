@@ -9,7 +9,7 @@ import pytest
 from gftorf_warp import cli, demo
 from gftorf_warp.errors import UsageError
 
-SMALL = ["--size", "48x36", "--frames", "12", "--images", "240", "--device", "cpu"]
+SMALL = ["--size", "48x36", "--frames", "12", "--images", "160", "--device", "cpu"]
 
 
 @pytest.fixture(scope="module")
