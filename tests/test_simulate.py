@@ -291,7 +291,8 @@ def test_noise_has_the_strength_of_the_light():
         adc_bits=16,
     )
     scene = slider(sensor=sensor, frames=40, bodies=(room(),), width=64)
-    noise = record(scene).sequence.quads - record(scene, noise=False).sequence.quads
+    clean = record(scene, noise=False, frames=4).sequence.quads  # the same in every quartet
+    noise = record(scene).sequence.quads - np.tile(clean, (10, 1, 1))
     hit = first_hit(scene.bodies, scene.camera(), 0.0)
     gain = 3e6
     electrons = (

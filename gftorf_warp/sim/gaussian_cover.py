@@ -23,7 +23,7 @@ obey Lambert's law, and not the model that is fitted to them.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -119,20 +119,29 @@ class Cover:
         rotation = pose[:3, :3]
         mean = self.point @ rotation.T + pose[:3, 3]
         ray = mean - centre
-        length = np.linalg.norm(ray, axis=1)
+        length = np.sqrt(_dot(ray, ray))
         sides = (self.normal, self.other)
-        cosine, cosine_other = (-np.sum(n @ rotation.T * ray, axis=1) / length for n in sides)
+        cosine, cosine_other = (-_dot(n @ rotation.T, ray) / length for n in sides)
         shown = (cosine > self.limb) & (cosine_other > self.limb)
         cosine = 0.5 * (cosine + cosine_other)
         count = int(shown.sum())
+        if self.body is None:
+            turns = self._at_rest[shown]
+        else:
+            turns = quaternions(rotation @ self.frame[shown])
         return GaussianField(
             mean=_tensor(mean[shown]),
             log_scale=_tensor(np.log(self.scale[shown])),
-            quaternion=_tensor(quaternions(rotation @ self.frame[shown])),
+            quaternion=_tensor(turns),
             opacity_logit=torch.full((count,), OPACITY_LOGIT),
             reflectivity_sh=constant_sh(_tensor(self.reflectance[shown] * cosine[shown])),
             colour_sh=constant_sh(_tensor(self.albedo[shown])).mT if colour else None,
         )
+
+    @cached_property
+    def _at_rest(self) -> Float[np.ndarray, "N 4"]:
+        """Quaternions of all discs as they are stored; still ones are the same at all times."""
+        return quaternions(np.eye(3) @ self.frame)
 
 
 def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
@@ -294,6 +303,12 @@ def magnification(camera: Camera) -> float:
     flat = camera.directions().flatten(0, 1).numpy()
     xx, xy, yy = camera.distortion.slope(*(flat[:, :2] / flat[:, 2:]).T)
     return float((0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)).max())
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Scalar products of rows of three, whose reductions are slow."""
+    x, y, z = (a * b).T
+    return x + y + z
 
 
 def _tensor(array: np.ndarray) -> torch.Tensor:
