@@ -137,9 +137,7 @@ def test_the_better_attempt_stays(tmp_path, monkeypatch, sequence, single):
     assert same(ours, other)
 
 
-def test_an_interrupted_run_goes_on_with_its_attempt(
-    tmp_path, monkeypatch, sequence, failed_twice
-):
+def test_an_interrupted_run_goes_on_with_its_attempt(tmp_path, monkeypatch, sequence, failed_twice):
     """Stopped in the second attempt, it ends in the bytes of an uninterrupted one."""
     seen = []
 
