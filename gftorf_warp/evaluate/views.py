@@ -122,7 +122,7 @@ def gather(
         if rendering.source is not None:
             rows.setdefault("d_fit", []).append(fit.distance.cpu().numpy().copy())
             rows.setdefault("source", []).append(rendering.source.cpu().numpy())
-        others = [run.corrected(light[f], time, camera, f).quads for f in further]
+        others = [run.corrected(light[f], time, camera, f, light_only=True).quads for f in further]
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,

@@ -130,9 +130,17 @@ class Run(StoredRun):
         return self.corrected(rendering, time, camera, f_mod_hz)
 
     def corrected(
-        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
+        self,
+        rendering: Rendering,
+        time: float,
+        camera: Camera,
+        f_mod_hz: float | None = None,
+        *,
+        light_only: bool = False,
     ) -> Rendering:
-        """A rendering, with its phasor, after the settings ``fallback`` and ``outlines``."""
+        """A rendering, with its phasor, after the settings ``fallback`` and ``outlines``; with
+        ``light_only`` its quads and phasor only, which outlines do not change.
+        """
         if not self._corrects:
             return rendering
         if self.fallback is not None:
@@ -141,7 +149,7 @@ class Run(StoredRun):
         phasor = None
         if measured is not None:
             phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
-        if self.config["settings"].get("outlines"):
+        if self.config["settings"].get("outlines") and not light_only:
             rendering = outlines.resolved(rendering, sensor, phasor)
         if phasor is None or self.fallback is None:
             return rendering

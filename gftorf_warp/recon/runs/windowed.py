@@ -108,11 +108,20 @@ class WindowedRun(WithoutGaussians):
         return shown
 
     def corrected(
-        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
+        self,
+        rendering: Rendering,
+        time: float,
+        camera: Camera,
+        f_mod_hz: float | None = None,
+        *,
+        light_only: bool = False,
     ) -> Rendering:
         """As :meth:`Run.corrected`, by the windows of the time."""
         return self.joined.rendered(
-            time, lambda window, local: window.corrected(rendering, local, camera, f_mod_hz)
+            time,
+            lambda window, local: window.corrected(
+                rendering, local, camera, f_mod_hz, light_only=light_only
+            ),
         )
 
     def edited(self, field: GaussianField, rows: Int[Tensor, "N"] | None = None) -> Run:  # noqa: ARG002
