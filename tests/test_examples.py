@@ -27,7 +27,7 @@ def test_one_gaussian_decodes_to_where_it_is():
 def test_offsets_are_recovered():
     """Phase offset and DC offset come out of the quads of a known scene."""
     example = load("02_gradients_to_the_sensor")
-    phase_offset, dc_offset = example.main()
+    phase_offset, dc_offset = example.main(steps=140)
     assert phase_offset == pytest.approx(example.TRUE_PHASE_OFFSET, abs=1e-3)
     assert dc_offset == pytest.approx(example.TRUE_DC_OFFSET, abs=1e-3)
 
@@ -49,7 +49,7 @@ def test_a_sequence_is_read_and_motion_breaks_its_closed_form(tmp_path, capsys):
 
 def test_reconstruction_from_python(tmp_path):
     """All steps by function calls; the quality is the demo's business, not this test's."""
-    metrics = load("05_reconstruct").main(tmp_path, images=80)
+    metrics = load("05_reconstruct").main(tmp_path, images=24)
     assert metrics["frames"] == 12
     assert metrics["d_mse_x100"] > 0
     assert metrics["closed_form_mse_x100"] > 0
@@ -57,9 +57,9 @@ def test_reconstruction_from_python(tmp_path):
 
 def test_phasors_of_a_moving_camera_from_python(tmp_path):
     """Every phasor is scored, colour too, and the course of the preset fits into few images."""
-    metrics = load("06_moving_camera").main(tmp_path, images=40)
+    metrics = load("06_moving_camera").main(tmp_path, images=20)
     assert metrics["frames"] == 4
-    assert metrics["images_optimised"] == 40
+    assert metrics["images_optimised"] == 20
     assert metrics["colour_psnr_db"] > 0
     assert metrics["input"] == "phasor"
 
