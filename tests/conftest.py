@@ -2,8 +2,15 @@
 made once, and the longest files begin first. Which tests go without the check of shapes.
 """
 
+import os
+
 import jaxtyping
 import pytest
+
+# Several processes of pytest-xdist share the cores; threads of torch, two in each, would wait for
+# each other. Here, because OpenMP reads it when torch is imported.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Nothing is checked behind pages, command lines, readers and writers; kernels, simulations and long
 # fits would take a fifth longer, behind what other tests check.

@@ -131,6 +131,27 @@ def room_of(path):
     return path.relative_to(ROOT).parts[0]
 
 
+def each(things, name_of):
+    """Make a check of one thing a test of all of them, which names every one that fails: thousands
+    of parametrised tests would take longer to start and report than to run.
+    """
+
+    def decorate(check):
+        def test():
+            wrong = []
+            for thing in things:
+                try:
+                    check(thing)
+                except AssertionError as error:
+                    wrong.append(f"{name_of(thing)}: {error}")
+            assert not wrong, "\n".join(wrong)
+
+        test.__name__, test.__doc__ = check.__name__, check.__doc__
+        return test
+
+    return decorate
+
+
 @functools.cache
 def nodes_of(path):
     """The syntax tree of a file, and all nodes below."""
@@ -164,7 +185,7 @@ def module_level_imports(path):
             yield from imports(ast.walk(node), path)
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@each(FILES, name_of)
 def test_module_imports_what_its_room_may(path):
     """No upward import, no package the room does not need,
     nothing heavy before a function needs it.
@@ -195,7 +216,7 @@ def test_module_imports_what_its_room_may(path):
         )
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@each(FILES, name_of)
 def test_module_names_no_device_and_launches_nowhere_else(path):
     """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says,
     streams likewise.
@@ -217,7 +238,7 @@ def test_module_names_no_device_and_launches_nowhere_else(path):
             )
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@each(FILES, name_of)
 def test_file_is_a_page_or_a_few(path):
     """A file is one idea, and has a name that says which."""
     text = path.read_text()
@@ -234,7 +255,7 @@ def test_file_is_a_page_or_a_few(path):
     assert not wide, f"more than {MAX_COLUMNS} columns in lines {wide}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@each(FILES, name_of)
 def test_everything_public_says_what_it_is(path):
     """Modules, public classes, their public methods and public functions have docstrings;
     so has each setting.
@@ -272,7 +293,7 @@ def kernels():
             if isinstance(node, ast.FunctionDef) and any(
                 "kernel" in ast.unparse(d) for d in node.decorator_list
             ):
-                yield pytest.param(path, node, id=f"{path.stem}.{node.name}")
+                yield path, node
 
 
 def comment_of(source, number):
@@ -288,11 +309,12 @@ def comment_of(source, number):
 KERNELS = list(kernels())
 
 
-@pytest.mark.parametrize(("path", "node"), KERNELS)
-def test_kernel_signature_is_readable(path, node):
+@each(KERNELS, lambda kernel: f"{kernel[0].stem}.{kernel[1].name}")
+def test_kernel_signature_is_readable(kernel):
     """Kernels live in kernels/, list inputs then outputs,
     type every parameter and say its [shape] or [unit].
     """
+    path, node = kernel
     assert room_of(path) == "kernels"
     source = path.read_text().splitlines()
     signature = [line.strip() for line in source[node.lineno : node.body[0].lineno - 1]]
@@ -308,7 +330,7 @@ def test_kernel_signature_is_readable(path, node):
 
 
 def test_there_are_kernels_to_look_at():
-    """The test above is parametrised by what it finds; finding nothing must not pass."""
+    """The test above reads what it finds; finding nothing must not pass."""
     assert len(KERNELS) >= 8
 
 
@@ -382,7 +404,7 @@ def attributes(node):
     return names
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@each(FILES, name_of)
 def test_class_is_small(path):
     """A class has at most 150 lines and 15 attributes; more are several ideas."""
     for node in nodes_of(path):
@@ -418,9 +440,7 @@ OTHERS = (
 PRIVATE = re.compile(rf"(?<![\w.])(?!({OTHERS})\b)[a-zA-Z]\w*(\.\w+)*\._(?!_|replace\b)[a-z]")
 
 
-@pytest.mark.parametrize(
-    "path", sorted((REPOSITORY / "tests").glob("*.py")), ids=lambda path: path.name
-)
+@each(sorted((REPOSITORY / "tests").glob("*.py")), lambda path: path.name)
 def test_tests_use_no_private_names(path):
     """Tests are of behaviour: a name that begins with an underscore may change at any time."""
     for number, line in enumerate(path.read_text().splitlines(), start=1):
@@ -466,7 +486,7 @@ def test_no_number_means_something_else():
     )
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if room_of(p) == "kernels"], ids=name_of)
+@each([p for p in FILES if room_of(p) == "kernels"], name_of)
 def test_kernels_compare_with_no_nameless_negative_number(path):
     """``x == -1`` asks for a meaning that only a legend has; a constant has a name."""
     for number, line in enumerate(path.read_text().splitlines(), start=1):
@@ -475,9 +495,7 @@ def test_kernels_compare_with_no_nameless_negative_number(path):
         )
 
 
-@pytest.mark.parametrize(
-    "folder", sorted({p.parent for p in FILES if room_of(p) == "kernels"}), ids=name_of
-)
+@each(sorted({p.parent for p in FILES if room_of(p) == "kernels"}), name_of)
 def test_a_folder_of_kernels_lists_its_files(folder):
     """Docstrings of kernels/ and of its folders name every file and folder,
     and nothing that is not there.
