@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -125,6 +126,7 @@ def top_parser(parsers: dict[str, Parser]) -> Parser:
     return parser
 
 
+@functools.cache  # the same for every call of `cli.main` in a program
 def command_parsers() -> dict[str, Parser]:
     """One parser per command, by name."""
     demo = Parser.of(

@@ -7,6 +7,7 @@ nothing is refused that would have worked.
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -184,15 +185,20 @@ def _of_control_group() -> float | None:
     return min(margins, default=None)
 
 
-def _groups_below(base: Path) -> set[Path]:
+def _groups_below(base: Path) -> frozenset[Path]:
     """Folders of the groups that this process is in; some of them may not exist."""
     try:
-        lines = OWN_GROUPS.read_text().splitlines()
+        listed = OWN_GROUPS.read_text()
     except OSError:  # no Linux
-        return {base}
-    inner = [base / line.split(":", 2)[-1].lstrip("/") for line in lines]
+        return frozenset({base})
+    return _folders_of(base, listed)
+
+
+@functools.lru_cache(maxsize=8)  # asked for every file of a recording
+def _folders_of(base: Path, listed: str) -> frozenset[Path]:
+    inner = [base / line.split(":", 2)[-1].lstrip("/") for line in listed.splitlines()]
     outer = {one for path in inner for one in path.parents if one.is_relative_to(base)}
-    return {base, *inner, *outer}
+    return frozenset({base, *inner, *outer})
 
 
 def _of_address_space() -> float | None:

@@ -67,7 +67,7 @@ class Camera:
             if not math.isfinite(value := getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {value}")
         rotation = pose[:3, :3]
-        orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        orthogonal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-4
         if not orthogonal or np.linalg.det(rotation) < 0:
             raise ValueError(
                 f"camera_from_world: its upper left 3x3 is not a rotation: {rotation.tolist()}"

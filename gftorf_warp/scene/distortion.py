@@ -21,7 +21,7 @@ from the axis.
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import numpy as np
@@ -69,7 +69,7 @@ class Distortion:
 
     def __bool__(self) -> bool:
         """Whether any coefficient is not zero."""
-        return any(astuple(self))
+        return any(vars(self).values())
 
     def apply(
         self, x: Coordinate, y: Coordinate, radius: float = math.inf
