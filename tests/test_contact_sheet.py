@@ -94,6 +94,13 @@ def test_any_sequence_has_one(recording, kind):
     assert titles(sequence, truth)
 
 
+def test_a_line_of_pixels_has_one():
+    """However flat the images are."""
+    line = record(SCENES["sliding"], frames=4, size=(700, 1), engine="mesh")
+    sheet = np.frombuffer(contact_sheet(line.sequence, line.truth, "a line"), np.uint8)
+    assert cv2.imdecode(sheet, cv2.IMREAD_COLOR).std() > 10
+
+
 def test_unknown_pixels_are_grey_and_ends_are_the_ends_of_the_scale():
     """The colour of a number is that of its place on the bar beside it."""
     image = np.array([[0.0, 1.0, np.nan, 0.5]])

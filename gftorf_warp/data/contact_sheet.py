@@ -55,7 +55,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
 
 def painted(sequence: Sequence, title: str, shown: str, panels: list[list[Panel]]) -> bytes:
     """PNG of rows of panels, all as large as images of the sequence, under a heading."""
-    height = round(PANEL * sequence.height / sequence.width)
+    height = max(1, round(PANEL * sequence.height / sequence.width))
     cell = PANEL + BAR_GAP + BAR + BAR_TEXT
     rows = 2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP)
     sheet = np.full((rows, 2 * MARGIN + COLUMNS * (cell + GAP) - GAP, 3), 255, dtype=np.uint8)
