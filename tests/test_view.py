@@ -102,6 +102,24 @@ def test_chi_square_is_at_the_size_of_the_sequence(fitted):
     assert "chi-square" not in scene.colours_of(alone)
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["truth", "no truth"])
+def test_a_recording_without_a_complete_quartet_is_shown(known, tmp_path):
+    """Two raw frames of four: quads, and the truth if there is one."""
+    two = {name: getattr(sequence(), name)[:2] for name in ("quads", "measured", "shifts", "times")}
+    exact = analytic_run.truth()
+    truth = replace(exact, distance=exact.distance[:2], known=exact.known[:2]) if known else None
+    cut = replace(sequence(), **two, camera_from_world=sequence().camera_from_world[:2])
+    subject = Subject.open(write("ftorf", tmp_path / "seq", cut, truth))
+    assert subject.recording.width > 0
+    for colour in scene.colours_of(subject):
+        choice = Choice(colour=colour, pixel=(3, 4))
+        assert [cloud.title for cloud in scene.clouds(subject, choice)] == [TRUTH] * known
+        assert (colour == "quads") <= bool(scene.pictures_of(subject, 1, colour))
+    series = pixel.series_of(subject, (3, 4), 0)
+    drawing = pixel.drawing(subject, series, 0)
+    assert b"180" in drawing
+
+
 def test_clouds_stand_beside_each_other(analytic):
     """Points at the distances along the rays; closed form left and truth right of ours."""
     found = {cloud.title: cloud for cloud in scene.clouds(analytic, POINTS)}

@@ -179,7 +179,8 @@ def _palette(name: str) -> UInt8[np.ndarray, "C 3"]:
 
 def _range(images: Iterable[np.ndarray], low: float, high: float) -> tuple[float, float]:
     """Percentiles of all finite values; (0, 0) if there are none."""
-    values = np.concatenate([np.asarray(image)[np.isfinite(image)].ravel() for image in images])
+    known = [np.asarray(image)[np.isfinite(image)].ravel() for image in images]
+    values = np.concatenate(known) if known else np.zeros(0)
     if not values.size:
         return 0.0, 0.0
     return float(np.percentile(values, low)), float(np.percentile(values, high))

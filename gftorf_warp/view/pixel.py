@@ -56,7 +56,8 @@ def series_of(subject: Subject, pixel: tuple[int, int], now: int) -> Series:
 def drawing(subject: Subject, series: Series, now: int) -> bytes:
     """An SVG of the quads over time: dots are measured, lines the fit, one colour per slot."""
     sequence, milliseconds, curves = subject.sequence, 1e3 * series.times, []
-    for k, colour in zip(range(sequence.cycle), cycle(TERM_COLOURS), strict=False):
+    slots = range(min(sequence.cycle, sequence.frames))
+    for k, colour in zip(slots, cycle(TERM_COLOURS), strict=False):
         label = f"{np.degrees(sequence.shifts[k]):.0f}\N{DEGREE SIGN}"
         if len(sequence.frequencies) > 1:
             label += f" {sequence.frame_frequencies[k] / 1e6:.4g} MHz"
