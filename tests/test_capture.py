@@ -189,6 +189,18 @@ def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
     ]
 
 
+def test_an_instant_has_no_exposure(tmp_path):
+    """A sensor that takes instants is recorded and read again; no exposure is of no length."""
+    options = {"frames": 4, "size": (16, 12), "format": "capture"}
+    path = simulate("demo", tmp_path / "a", overrides=["sensor=ftorf_synthetic"], **options)
+    assert Sequence.open(path).exposures is None
+    assert Sequence.open(simulate("demo", tmp_path / "b", **options)).exposures.tolist() == (
+        [Sensor().exposure_s] * 4
+    )
+    with pytest.raises(UsageError, match="exposures"):
+        write("capture", tmp_path / "c", recording(exposures=np.zeros(FRAMES))[0])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -132,6 +132,9 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     expected = "seconds since the first raw frame, never decreasing"
     holds = np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all()
     require(holds, "times", expected, f"{times[:8].tolist()} ..")
+    exposures = sequence.exposures
+    holds = exposures is None or (np.isfinite(exposures) & (exposures > 0)).all()
+    require(holds, "exposures", "seconds above 0, or None where they are unknown", exposures)
     scale = stated.quad_scale
     constant = (stated.dc_offset, stated.adc_zero)
     constants = (stated.f_mod_hz, stated.phase_offset, *constant, scale or 1.0)

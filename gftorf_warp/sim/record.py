@@ -150,7 +150,7 @@ def record(
             **sequence_fields(sensor, times, cameras, **sensor_settings(sensor)),
             novel_from_world=np.stack(views) if views else None,
             flow=_flows(scene, cameras, times) if settings.flow else Flow(),
-            exposures=np.full(len(times), sensor.exposure_s),
+            exposures=np.full(len(times), sensor.exposure_s) if sensor.exposure_s else None,
             tap_sums=dict(enumerate(images["tap_sum"])) if settings.taps else {},
             colour=_colour(scene, settings, times, cached),
         ),
