@@ -192,6 +192,26 @@ def test_both_engines_are_shaded_alike():
         )
 
 
+def test_the_light_of_the_truth_is_that_of_the_quads():
+    """Amplitude and the parts of the light, as the lens and the beam weaken them; not the share of
+    ambient light, which belongs to the surface.
+    """
+    lens = Lens(cosine_power=4.0, beam_power=2.0)
+    active = shading(lens, scene().camera()).active
+    for engine in ("gaussian", "mesh"):
+        more = {"format": "capture", "truth": "all"} if engine == "mesh" else {}
+        plain, shaded = (
+            record(scene(lens=one), engine=engine, noise=False, **more) for one in (Lens(), lens)
+        )
+        before, after = plain.truth, shaded.truth
+        np.testing.assert_allclose(after.amplitude, before.amplitude * active, rtol=1e-6)
+        quads = shaded.sequence.quads[:2].astype(np.float64)
+        np.testing.assert_allclose(quads.mean(0), after.amplitude[0], rtol=1e-5)
+        for name, images in after.layers.items():
+            factor = active if name == "phasor.1" else 1.0
+            np.testing.assert_allclose(images, before.layers[name] * factor, rtol=1e-5, atol=1e-9)
+
+
 def test_a_beam_keeps_its_power():
     """Sensor notes, T6: whatever its shape, its mean over the solid angle of the image is 1;
     ambient light has none.

@@ -36,6 +36,7 @@ Cached = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
 """Images of a name, computed now or before an interruption, and whether computed now."""
 
 LAYER = "layer "  # begins the names of layers among the images of a raw frame
+LIGHT = ("direct", "error", "phasor")  # layers that the lens weakens, up to the harmonic in a name
 COLOUR = 3  # part of the seed of the colour camera's noise
 
 
@@ -218,14 +219,19 @@ def _exposing(
             shading=evenness,
             taps=settings.taps,
         )
+        seen = np.float32(1.0) if evenness is None else evenness.active.astype(np.float32)
+        layers = {
+            f"{LAYER}{name}": image * seen if name.partition(".")[0] in LIGHT else image
+            for name, image in (exposure.layers or {}).items()
+        }
         return {
             "quad": reading.quad,
             **({} if reading.total is None else {"tap_sum": reading.total}),
             "saturated": reading.saturated.sum(),
-            "amplitude": exposure.amplitude.astype(np.float32),
+            "amplitude": exposure.amplitude.astype(np.float32) * seen,
             "distance": exposure.distance,
             "phasor_distance": _static_distance(exposure, shot),
-            **{f"{LAYER}{name}": image for name, image in (exposure.layers or {}).items()},
+            **layers,
         }
 
     return expose
