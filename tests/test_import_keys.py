@@ -88,6 +88,7 @@ def test_equal_times_are_uncertain(tmp_path):
         ("rate_hz = 0", None, "above 0"),
         ("rate_hz = 3\nfile = 't.csv'", "1\n", "both state the times"),
         ("cycle_rate_hz = 3", None, "time.slot_period_s"),
+        ("rate_hz = 30\nslot_period_s = 0.002", None, "time.cycle_rate_hz"),
         ("cycle_rate_hz = 3\nslot_period_s = 20", None, "longer than the shortest cycle"),
         ("file = 'none.csv'", "1\n", "none.csv"),
         ("file = 't.csv'", "1\n2\n", "time.slot_period_s"),

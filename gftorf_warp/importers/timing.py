@@ -89,6 +89,10 @@ def times_of(
         starts = np.arange(-(-frames // cycle)) / rate
         source = f"{rate:g} cycles per second"
         return with_slots(settings, notes, starts, frames, cycle, source)
+    if settings.given("time.slot_period_s"):
+        why = "time.rate_hz states the times of all raw frames, evenly"
+        fix = "remove it, or count cycles: time.cycle_rate_hz in place of time.rate_hz"
+        raise settings.wrong("time.slot_period_s", why, fix)
     rate = settings["time.rate_hz"]
     notes.understood.append(f"times: {rate:g} raw frames per second, evenly (time.rate_hz)")
     return np.arange(frames) / rate
