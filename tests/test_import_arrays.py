@@ -324,6 +324,15 @@ def test_missing_raw_frames(tmp_path):
     assert found.measured.tolist() == [True, True, False, True, True, False, False, True]
     assert np.array_equal(found.quads[7], codes[7])
     assert found.times[7] == pytest.approx(7 * recording()[0].times[1])
+    found = imported(root, values__zero=0, source__numbered=True)
+    assert any("f_3.npy is taken as raw frame 0" in text for text in found.uncertain)
+
+
+def test_half_precision_loses_nothing_more(tmp_path):
+    """The zero is subtracted in double precision, whatever the stored type."""
+    codes = (recording()[1] / 64.0).astype(np.float16)
+    found = imported(arrays(tmp_path, a=codes), values__zero=2000.25)
+    assert np.array_equal(found.sequence.quads, (codes.astype(float) - 2000.25).astype("f4"))
 
 
 def test_every_decision_is_stated(tmp_path):

@@ -96,7 +96,8 @@ class Decoder:
         invalid = np.isin(stored, self.settings["values.invalid"]) & ~saturated
         codes = self._codes(stored)
         with np.errstate(over="ignore", invalid="ignore"):  # NaN, and numbers beyond float32
-            quads = (codes - self.settings["values.zero"]).astype(np.float32)
+            zero = self.settings["values.zero"]
+            quads = np.subtract(codes, zero, dtype=np.float64).astype(np.float32)
         invalid |= ~np.isfinite(quads) & ~saturated
         self.pixels += stored.size
         self.invalid += int(invalid.sum())

@@ -135,6 +135,11 @@ def frame_numbers(files: list[Path], settings: Settings, notes: Notes) -> list[i
     if numbers[-1] - numbers[0] >= SPARSE * len(numbers):
         why = f"{len(numbers)} files would be raw frames {numbers[0]} to {numbers[-1]}"
         raise settings.wrong("source.numbered", why, "leave it out, or name files by number")
+    if numbers[0] > 1:
+        text = f"{files[0].name} is taken as raw frame 0, the first of a cycle"
+        notes.uncertain.append(
+            f"{text}: if files before it are lost, shifts may be those of others"
+        )
     if gaps:
         notes.understood.append(f"frames: {numbers[-1] - numbers[0] + 1 - len(numbers)} missing")
     return [number - numbers[0] for number in numbers]
