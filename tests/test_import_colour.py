@@ -164,6 +164,7 @@ def test_raw_files_of_a_recording(tmp_path):
 BAD = [  # changed keys, a word of the error
     ({"colour__encoding": None}, "colour.encoding"),
     ({"colour__rate_hz": None}, "colour.rate_hz"),
+    ({"colour__files": None}, "nothing without colour.files"),
     ({"colour__fx": None, "values__zero": None}, "2 keys are missing"),
     ({"colour__tof_from_colour": None}, "or colour.poses.file"),
     (

@@ -208,6 +208,13 @@ def test_keys_of_poses_are_asked_for(writer, changes, word, tmp_path):
     assert word in str(error.value)
 
 
+def test_keys_of_poses_without_a_file_are_no_camera_at_rest(tmp_path):
+    """They would do nothing; those that have a default, as in a template, may be there."""
+    with pytest.raises(InputError, match=r"poses\.start_s mean nothing without poses\.file"):
+        read(tmp_path, poses__form="tum", poses__start_s=3.0)
+    assert (read(tmp_path, poses__axes="opencv").sequence.camera_from_world == np.eye(4)).all()
+
+
 def test_images_are_found_by_name(tmp_path):
     """In full, or without folder and suffix if only one is called so; some without a pose are
     named.

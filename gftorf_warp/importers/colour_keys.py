@@ -114,7 +114,12 @@ def files_of(settings: Settings, source: Path) -> list[Path]:
 
 
 def needed_keys(settings: Settings, files: list[Path]) -> list[str]:
-    """Keys without which these colour images cannot be used; none if there are no files."""
+    """Keys without which these colour images cannot be used; none if there are no files.
+
+    Raises:
+        InputError: If other keys of the table are given, and no files.
+    """
+    settings.refuse_without("colour.files")
     lens = [] if settings["colour.file"] else [f"colour.{name}" for name in camera_keys.PINHOLE]
     encoding = ["colour.encoding"] if any(map(is_picture, files)) else []
     start = ["colour.time_start_s"] if settings["colour.time_file"] else []

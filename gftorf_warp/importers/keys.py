@@ -102,6 +102,22 @@ class Settings:
             raise UsageError(what, where=CONFIG, why=why, fix=f"{fix}{CONFIG} FILE.toml")
         raise InputError(what, where=self.path, why=why, fix="add them")
 
+    def refuse_without(self, name: str) -> None:
+        """Check that no key of the table of ``name`` is given without it; those with a default
+        may be.
+
+        Raises:
+            InputError: If one is, since it would do nothing.
+        """
+        table = name.rpartition(".")[0]
+        of_table = [key for key in self.values if key.startswith(f"{table}.")]
+        alone = [key for key in of_table if self.keys[key].default is None]
+        if alone and not self.given(name):
+            why = f"{', '.join(alone)} mean nothing without {name}: {self.keys[name].about}"
+            raise InputError(
+                "a key is missing", where=self.path, why=why, fix="add it, or remove these"
+            )
+
     def wrong(self, name: str, why: str, fix: str) -> InputError:
         """The error for a key whose value does not fit."""
         return InputError(f"{name}: not usable", where=self.path or CONFIG, why=why, fix=fix)

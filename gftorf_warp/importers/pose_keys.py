@@ -70,7 +70,12 @@ KEYS = pose_keys("poses", "ToF camera")
 
 
 def needed_keys(settings: Settings, table: str = "poses") -> list[str]:
-    """Keys without which the file of poses cannot be used; none if there is no file."""
+    """Keys without which the file of poses cannot be used; none if there is no file.
+
+    Raises:
+        InputError: If other keys of the table are given, and no file.
+    """
+    settings.refuse_without(f"{table}.file")
     form = settings[f"{table}.form"]
     by_form = {"tum": "start_s", "matrices": "direction"} | dict.fromkeys(
         UNSCALED, "metres_per_unit"
@@ -106,10 +111,10 @@ def poses_of(
     Raises:
         UsageError, InputError: If keys are missing, or the file does not have these poses.
     """
-    path = settings.file(f"{table}.file", root)
+    path, needed = settings.file(f"{table}.file", root), needed_keys(settings, table)
     if path is None:
         return None
-    settings.require(*needed_keys(settings, table))
+    settings.require(*needed)
     form = settings[f"{table}.form"]
     backward = settings[f"{table}.direction"] == DIRECTIONS[0]
     opengl = settings[f"{table}.axes"] == "opengl"
