@@ -9,7 +9,7 @@ import pytest
 from gftorf_warp.errors import InputError
 from gftorf_warp.importers import camera_keys
 from gftorf_warp.importers.imported import Notes
-from gftorf_warp.importers.keys import load
+from gftorf_warp.importers.keys import load, template
 from gftorf_warp.importers.lens_files import read_lens
 
 FX, FY, CX, CY = 20.5, 21.25, 8.5, 6.125  # pixel centres at i + 0.5
@@ -90,6 +90,17 @@ def test_a_lens_of_any_file(name, tmp_path):
     ours = cv2.projectPoints(point, np.zeros(3), np.zeros(3), matrix, np.array(lens.distortion))
     np.testing.assert_allclose(ours[0].ravel(), seen + 0.5, atol=1e-12)
     assert any(path.name in line for line in notes.understood)
+
+
+def test_a_template_leaves_pixel_centres_to_the_file_of_the_lens(tmp_path):
+    """COLMAP counts from corners, whatever typed numbers do by default."""
+    colmap(tmp_path / "cameras.txt")
+    given = "file = 'cameras.txt'\nnumber = 2\n"
+    text = template("any", camera_keys.KEYS).replace("[camera]\n", f"[camera]\n{given}")
+    (tmp_path / "keys.toml").write_text(text)
+    settings = load(tmp_path / "keys.toml", camera_keys.KEYS)
+    lens = camera_keys.intrinsics_of(settings, Notes(), 16)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (FX, FY, CX, CY)
 
 
 def test_other_names_and_fewer_coefficients(tmp_path):

@@ -161,8 +161,13 @@ def load(path: Path | None, keys: Iterable[Key]) -> Settings:
 
 
 def template(title: str, keys: Iterable[Key]) -> str:
-    """A TOML file of all keys with comments: defaults are set, needed keys wait to be filled in."""
-    lines = [f"# {title}", "# Remove '# ' before a needed key and give its value."]
+    """A TOML file of all keys in comments, with their defaults, or else examples. Defaults are not
+    set: where a key is not given, a file that it is about may state the value.
+    """
+    lines = [
+        f"# {title}",
+        "# Remove '# ' before a key to give its value; others have their defaults.",
+    ]
     table = ""
     for key in sorted(keys, key=lambda key: "." in key.name):
         head, _, name = key.name.rpartition(".")
@@ -171,9 +176,10 @@ def template(title: str, keys: Iterable[Key]) -> str:
             table = head
         allowed = f"; {', '.join(map(str, key.choices))}" if key.choices else ""
         text = f"{'needed: ' if key.needed else ''}{key.about}{allowed}{_instead(key)}"
+        text += "" if key.default is None else " [default:]"
         lines += textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="#   ")
         value = key.example if key.default is None else key.default
-        lines.append(f"{'# ' if key.default is None else ''}{name} = {_toml(value)}")
+        lines.append(f"# {name} = {_toml(value)}")
     return "\n".join(lines) + "\n"
 
 
