@@ -266,8 +266,11 @@ def _render(options: argparse.Namespace) -> int:
         why = "pictures need a folder, a video a file"
         raise UsageError("--out or --video is missing", where="gftorf render", why=why, fix=fix)
     device = start(options)
+    from .evaluate.video import checked
     from .evaluate.views import render_to_folder, render_to_video
 
+    if options.video is not None:
+        checked(options.video)  # before a folder is filled
     run = _opened(options, device)
     given = _named(options, "what", "times", "poses")
     if options.out is not None:

@@ -468,6 +468,9 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
     assert cli.main([*asked, "--device", "cpu"]) == 0
     assert lines_of(capsys)[0] == [str(film)]
     assert film.read_bytes()[8:12] == b"WEBP"
+    other = tmp_path / "other"
+    fails(["render", str(run), "--out", str(other), "--video", "film.avi"], 2, capsys, ".webm")
+    assert not other.exists(), "rendered for a video that cannot be"
     fails([*arguments, "--arrays"], 2, capsys, str(out_folder), "--fresh")
     assert cli.main([*arguments, "--arrays", "--fresh"]) == 0
     assert np.load(out_folder / "quads" / "quad_180.npy").shape[0] == 2
