@@ -193,3 +193,15 @@ def test_errors_are_means_of_squares():
     without = Truth(distance=truth.distance, known=truth.known)
     assert closed_form_errors(sequence, without).static_phasor is None
     assert isinstance(sequence, Sequence)
+
+
+@pytest.mark.parametrize(
+    ("level", "override", "word"),
+    [("L1", "sensor=ftorf_synthetic", "exposure_s"), ("L4", "sensor.contrast=0.95", "contrast")],
+)
+def test_a_sensor_that_a_level_does_not_fit_is_named(level, override, word, tmp_path):
+    """Noise in an exposure of no length; a wave of more than all light with its harmonics."""
+    with pytest.raises(UsageError, match=word) as error:
+        simulate("demo", tmp_path / "out", level=level, overrides=[override], frames=4)
+    assert error.value.where == "--level"
+    assert list(tmp_path.iterdir()) == []

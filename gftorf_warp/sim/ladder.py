@@ -108,7 +108,8 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, ResolvedSettin
     Resolving twice is the same as once. Settings that are given, and ``sync``, hold at every level.
 
     Raises:
-        UsageError: If there is no such level, or a field cannot be overridden so.
+        UsageError: If there is no such level, it does not fit the sensor, or a field cannot be
+            overridden so.
     """
     scene = overridden(scene, settings.overrides)
     frames = scene.frames if settings.frames is None else settings.frames
@@ -128,7 +129,11 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, ResolvedSettin
         {k: v for level in LEVELS[: NAMES.index(name) + 1] for k, v in getattr(level, part).items()}
         for part in ("scene", "sensor", "settings")
     )
-    sensor = _changed(scene.sensor, {k: v for k, v in of_sensor.items() if v is not OWN})
+    try:
+        sensor = _changed(scene.sensor, {k: v for k, v in of_sensor.items() if v is not OWN})
+    except ValueError as error:
+        what, fix = f"level {name} does not fit this sensor", "change the sensor, or the level"
+        raise UsageError(what, where="--level", why=str(error), fix=fix) from error
     if of_scene["emitter"] == EMITTER_M and any(scene.emitter):
         of_scene["emitter"] = OWN
     if of_scene["beam_deg"] == BEAM_DEG and scene.beam_deg is not None:
