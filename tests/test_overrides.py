@@ -103,3 +103,13 @@ def test_the_data_card_says_how_to_make_it_again(tmp_path):
     plain = simulate("sliding_cube", tmp_path / "plain", **SMALL)
     assert "--override" not in (plain / "README.md").read_text()
     assert not np.array_equal(Sequence.open(plain).quads, Sequence.open(path).quads)
+
+
+def test_an_infinite_number_is_refused_but_for_a_full_well(tmp_path):
+    """No body is nowhere; a tap may hold any number of electrons."""
+    for name in ("bodies.1.path.passing_s", "bodies.1.path.velocity"):
+        values = "0,0,inf" if name.endswith("velocity") else "inf"
+        with pytest.raises(UsageError, match=name):
+            simulate("demo", tmp_path / "no", overrides=[f"{name}={values}"], **SMALL)
+    simulate("demo", tmp_path / "yes", overrides=["sensor.full_well_electrons=inf"], **SMALL)
+    assert [path.name for path in tmp_path.iterdir()] == ["yes"]

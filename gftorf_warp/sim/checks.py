@@ -23,6 +23,7 @@ from .settings import ResolvedSettings, refuse, require
 # [m] nearer bodies fill the image, and a cover of them would need millions of splats
 CLEARANCE = 0.5
 NUMBER_MAX = 1e15  # of any quantity of a scene; its squares are far within float64
+UNLIMITED = "sensor.full_well_electrons"
 CAPTURE = "--format capture"
 ROLLING = "a rolling shutter cannot be simulated so", "sensor.row_time_s"
 
@@ -30,7 +31,8 @@ ROLLING = "a rolling shutter cannot be simulated so", "sensor.row_time_s"
 def check_numbers(scene: Scene) -> None:
     """Raise a UsageError if a number of the scene is of no quantity that exists."""
     for name, value in _numbers(scene):
-        require(abs(value) <= NUMBER_MAX, name, f"{value:g}", f"at most {NUMBER_MAX:g}")
+        good = abs(value) <= NUMBER_MAX or (name == UNLIMITED and value == math.inf)
+        require(good, name, f"{value:g}", f"at most {NUMBER_MAX:g}")
     for frequency in (scene.sensor.f_mod_hz, *scene.sensor.further_hz):
         least, most = (SPEED_OF_LIGHT / depth_range for depth_range in DEPTH_RANGES_M[::-1])
         wanted = f"{least:.3g} to {most:.3g} Hz, 20e6 for 20 MHz"
@@ -41,10 +43,9 @@ def check_numbers(scene: Scene) -> None:
 
 
 def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """The finite numbers of nested dataclasses and tuples, with their names."""
+    """The numbers of nested dataclasses and tuples, with their names."""
     if isinstance(value, (int, float)):
-        if math.isfinite(value):
-            yield name, value
+        yield name, value
     elif isinstance(value, tuple):
         for i, part in enumerate(value):
             yield from _numbers(part, f"{name}.{i}")
