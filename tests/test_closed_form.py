@@ -167,6 +167,17 @@ def test_what_cannot_be_shown_is_an_error(tmp_path):
         sequence.render(0.0)
 
 
+@pytest.mark.parametrize("form", ["torf", "ftorf"])
+def test_a_recording_of_one_instant_has_a_closed_form(form, tmp_path):
+    """A single phasor, or four quads that were taken at once."""
+    sequence, truth = recording(frames=4)
+    write(form, tmp_path / "one", replace(sequence, times=np.zeros(4)), truth)
+    run = reconstruct(tmp_path / "one", tmp_path / "run", "ctof")
+    expected = closed_form_distance(Sequence.open(tmp_path / "one"), 0)
+    np.testing.assert_allclose(run.render(0.0).distance.numpy(), expected, rtol=1e-6)
+    assert compare(run)["frames"] == (1 if form == "torf" else 4)
+
+
 def test_a_recording_with_colour_is_compared(tmp_path):
     """A closed form has no colour and no other view, so nothing is asked of the colour camera."""
     path = write("capture", tmp_path / "seq", with_colour(recording(frames=8)[0], size=(12, 9)))

@@ -63,7 +63,7 @@ def config_of(
 def _rate(sequence: Sequence) -> float:
     """Raw frames, or phasors, per second, as ``frame_rate_hz`` of the reader."""
     times = sequence.times[:: sequence.cycle if sequence.from_phasors else 1]
-    period = float(np.diff(times).mean()) if len(times) > 1 else frame_period(sequence)
+    period = float(np.diff(times).mean()) if times[-1] > 0 else frame_period(sequence)
     return round(1.0 / period, 9)  # of a time in seconds, which is no exact decimal
 
 

@@ -72,8 +72,8 @@ def _camera(intrinsics: Intrinsics, size: tuple[int, int], pose: np.ndarray) -> 
 
 
 def frame_period(sequence: Sequence) -> float:
-    """Mean time between raw frames [s]; 1 s for a single frame."""
-    return float(np.diff(sequence.times).mean()) if sequence.frames > 1 else 1.0
+    """Mean time between raw frames [s]; 1 s if all are of one instant."""
+    return float(np.diff(sequence.times).mean()) if sequence.times[-1] > 0 else 1.0
 
 
 def key_times(sequence: Sequence) -> Float[Tensor, "T"]:
