@@ -11,7 +11,9 @@ import pytest
 import torch
 from small_runs import small
 
+from gftorf_warp.cli import main
 from gftorf_warp.data.exr import write_exr
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.camera import Camera
@@ -270,6 +272,17 @@ def test_lenses_that_cannot_be(settings, says):
     """The message names the setting."""
     with pytest.raises(ValueError, match=says):
         Lens(**settings)
+
+
+def test_a_recording_of_a_lens_that_cannot_be_undone_is_bad_input(tmp_path, capsys):
+    """Coefficients of another order or resolution: the image folds inside of its borders."""
+    sequence = record(scene(sensor=Sensor(), frames=4)).sequence
+    folded = replace(sequence.intrinsics, distortion=(-5.0, 0.0, 0.0, 0.0, 0.0))
+    path = write("capture", tmp_path / "seq", replace(sequence, intrinsics=folded))
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "run"), "--preset", "ctof"]) == 3
+    error = capsys.readouterr().err
+    assert f"a lens that cannot be undone - {path}" in error
+    assert "k1=-5.0" in error
 
 
 @pytest.mark.parametrize("power", [-3.0, 4.0])

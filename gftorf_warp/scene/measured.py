@@ -16,6 +16,7 @@ from torch import Tensor
 from ..data.cycles import phase_noise
 from ..data.decode import quartet_phasors, unambiguous_range
 from ..data.sequence import Intrinsics, Sequence
+from ..errors import InputError
 from .camera import Camera
 from .distortion import Distortion
 from .sensor import Sensor, phasor_from_quads
@@ -45,9 +46,20 @@ def sensor_of(sequence: Sequence) -> Sensor:
 
 
 def camera_of(sequence: Sequence, frame: int) -> Camera:
-    """The camera of raw frame ``frame``."""
+    """The camera of raw frame ``frame``.
+
+    Raises:
+        InputError: If its lens cannot be undone over the whole image.
+    """
     size = sequence.height, sequence.width
-    return _camera(sequence.intrinsics, size, sequence.camera_from_world[frame])
+    try:
+        return _camera(sequence.intrinsics, size, sequence.camera_from_world[frame])
+    except ValueError as error:
+        if sequence.intrinsics.distortion is None:
+            raise
+        what, where = "a lens that cannot be undone", sequence.path or "sequence"
+        fix = "correct the distortion, k1, k2, p1, p2, k3 of OpenCV, or leave it out"
+        raise InputError(what, where=where, why=str(error), fix=fix) from error
 
 
 def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
