@@ -113,3 +113,22 @@ def test_an_infinite_number_is_refused_but_for_a_full_well(tmp_path):
             simulate("demo", tmp_path / "no", overrides=[f"{name}={values}"], **SMALL)
     simulate("demo", tmp_path / "yes", overrides=["sensor.full_well_electrons=inf"], **SMALL)
     assert [path.name for path in tmp_path.iterdir()] == ["yes"]
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("camera_path.target=0,5,0", ("camera_path", "from [0.0, 0.0, 0.0] to [0.0, 5.0, 0.0]")),
+        ("novel_views.2.target=0,5,0", ("novel_views.2", "straight up or down")),
+        ("camera_path.period_s=0", ("period_s", "must not be 0")),
+        ("colour.horizontal_fov_deg=190", ("horizontal_fov_deg", "between 0 and 180")),
+        ("colour.width=0", ("width", "at least 1")),
+    ],
+)
+def test_cameras_that_cannot_be_are_named(override, words, tmp_path):
+    """Before anything is recorded."""
+    overrides = ["camera_path.sweep_deg=0", "novel_views.2.position=0,0,0", override]
+    with pytest.raises(UsageError) as error:
+        simulate("tour", tmp_path / "no", overrides=overrides, **SMALL)
+    assert all(word in str(error.value) for word in words)
+    assert list(tmp_path.iterdir()) == []

@@ -108,6 +108,20 @@ def check_format(scene: Scene, settings: ResolvedSettings) -> None:
         raise UsageError(what, where="lens.distortion", why=str(error), fix=fix) from error
 
 
+def check_cameras(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
+    """Raise a UsageError if the camera at one of ``times`` [s], or a novel view, has no level
+    axis.
+    """
+    novel = ((f"novel_views.{i}", view, 0.0) for i, view in enumerate(scene.novel_views))
+    taken = (("camera_path", scene.camera_path, float(time)) for time in times)
+    for where, path, time in (*novel, *taken):
+        try:
+            path.world_from_body(time)
+        except ValueError as error:
+            what, fix = "a camera that cannot be placed", "choose another position or target"
+            raise UsageError(what, where=where, why=str(error), fix=fix) from error
+
+
 def check_clearance(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
     """Raise a UsageError if a body comes too near to the camera at one of ``times`` [s]."""
     centres = np.array([scene.camera(time=float(time)).centre for time in times])

@@ -53,7 +53,7 @@ def looking_at(
     ahead = np.subtract(target, position, dtype=np.float64)
     right = np.cross([0.0, 1.0, 0.0], ahead)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(ahead):
-        view = f"a view from {tuple(position)} to {tuple(target)}"
+        view = f"a view from {np.asarray(position).tolist()} to {np.asarray(target).tolist()}"
         raise ValueError(f"{view} is straight up or down: no axis is level")
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
@@ -157,6 +157,10 @@ class Sweep(Path):
     """Time for the way out and back [s]."""
     rise: float = 0.0
     """Rise in the middle of the way out, and descent in the middle of the way back [m]."""
+
+    def __post_init__(self):
+        if self.period_s == 0:
+            raise ValueError("period_s must not be 0: the camera swings out and back in it")
 
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
         """Pose at ``time`` [s]; at time 0 it rests at one end of the arc."""

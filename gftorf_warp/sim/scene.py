@@ -54,6 +54,12 @@ class ColourCamera:
     def __post_init__(self):
         if not self.noise >= 0:
             raise ValueError(f"noise must not be negative, got {self.noise}")
+        for name in ("width", "height"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.horizontal_fov_deg < 180:
+            wrong = self.horizontal_fov_deg
+            raise ValueError(f"horizontal_fov_deg must be between 0 and 180, got {wrong}")
 
     @property
     def colour_from_tof(self) -> Float[np.ndarray, "4 4"]:

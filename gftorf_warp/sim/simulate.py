@@ -16,7 +16,7 @@ from ..data.write import write
 from ..errors import UsageError
 from ..similar import did_you_mean
 from .card import outcome_card, settings_card
-from .checks import check_clearance, check_engine, check_format, check_numbers
+from .checks import check_cameras, check_clearance, check_engine, check_format, check_numbers
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
 from .ladder import NAMES, resolved
 from .random_scene import PREFIX
@@ -80,6 +80,7 @@ def simulate(
     _check_resources(recorded, used, Path(out))
     check_engine(recorded, used, device)
     check_format(recorded, used)
+    check_cameras(recorded, longest_times(recorded, used))
     check_clearance(recorded, longest_times(recorded, used))
     card = settings_card(requested, settings)
     out = Path(out).absolute() if fresh else Path(out)
