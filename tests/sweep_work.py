@@ -8,6 +8,8 @@ import signal
 import time
 from pathlib import Path
 
+from gftorf_warp.sweep.workers import parent_lives
+
 
 def die_once(task, place):
     """Kill the own process the first time."""
@@ -27,6 +29,14 @@ def sleep(task, place):  # noqa: ARG001
 def pid(task, place):  # noqa: ARG001
     """Which process does the work."""
     return os.getpid()
+
+
+def until_parent_ends(task, place):  # noqa: ARG001
+    """A job that says when it begins, and when it notices that nobody waits for it."""
+    Path(task, "begun").touch()
+    while parent_lives():
+        time.sleep(0.01)
+    Path(task, "noticed").touch()
 
 
 def cannot_load():

@@ -4,9 +4,12 @@ import errno
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -258,6 +261,42 @@ def test_a_process_that_is_killed_while_it_is_idle_is_replaced():
         os.kill(first, signal.SIGKILL)
         ((_, second),) = workers.outcomes([0])
     assert second != first
+
+
+def test_a_process_whose_parent_was_killed_notices(tmp_path):
+    """It works on nothing that a repeated sweep would wait for."""
+    program = f"""
+import multiprocessing, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from gftorf_warp.sweep.workers import Place, Workers
+from sweep_work import until_parent_ends
+with Workers([Place("cpu")], until_parent_ends) as workers:
+    multiprocessing.set_forkserver_preload([])  # it would import torch
+    [*workers.outcomes([{str(tmp_path)!r}])]
+"""
+    with subprocess.Popen([sys.executable, "-c", program]) as parent:
+        assert appears(tmp_path / "begun")
+        assert not (tmp_path / "noticed").exists()
+        parent.kill()
+    assert appears(tmp_path / "noticed")
+
+
+def test_a_job_whose_parent_was_killed_stops(swept, tmp_path, monkeypatch):
+    """Where its run can go on."""
+    monkeypatch.setattr("gftorf_warp.sweep.job.parent_lives", lambda: False)
+    plan = read_plan(swept[0] / "plan.toml")
+    job = next(job for job in plan.fits if job.id == "box/demo-0")
+    with pytest.raises(KeyboardInterrupt):
+        do(Task(job=job, plan=plan, out=tmp_path), Place("cpu"))
+    assert [*(tmp_path / "runs" / job.id / "ckpt").glob("*.pt")]
+
+
+def appears(path, patience_s=30.0):
+    """Whether a file is made in time."""
+    end = time.monotonic() + patience_s
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.01)
+    return path.exists()
 
 
 def test_a_process_that_cannot_import_its_work_says_so():

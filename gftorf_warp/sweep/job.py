@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 import traceback
 from collections.abc import Callable
@@ -28,7 +27,7 @@ from ..render.cuda import forget_peak_memory, peak_memory
 from ..sim.simulate import simulate
 from ..terminal import as_known_error, start_warp
 from .plan import Job, Plan
-from .workers import Place
+from .workers import Place, parent_lives
 
 Result = dict[str, Any]
 BUSY_S = 60.0  # [s] that a folder may be busy: a lost worker's process may still be ending
@@ -149,10 +148,9 @@ def _patiently(work: Callable[[], Any]) -> Any:
 
 def _while_parent_lives():
     """A progress callback that stops a job, with a checkpoint, whose parent was killed."""
-    parent = os.getppid()
 
     def check(*_: object, **__: object) -> None:
-        if os.getppid() != parent:
+        if not parent_lives():
             raise KeyboardInterrupt
 
     return check

@@ -71,6 +71,14 @@ def places(devices: Sequence[str], count: int | None = None) -> list[Place]:
     ]
 
 
+def parent_lives() -> bool:
+    """Whether the process whose :class:`Workers` started this one still runs; the parent that the
+    system names is the fork server, which runs as long as any worker does.
+    """
+    parent = multiprocessing.parent_process()
+    return parent is None or parent.is_alive()
+
+
 class Workers:
     """Processes that all do the same work.
 
