@@ -230,6 +230,7 @@ WRONG = {
     'scenes = ["demo"]\nrows = {a = {preset = "best", images = 0}}': "from 1 on",
     'scenes = ["demo"]\npresets = ["best"]\nrows = {best = {preset = "fast"}}': "this name",
     'scenes = ["demo"]\npresets = ["best"]\none_seed = ["bst"]': "did you mean best",
+    'scenes = ["demo"]\npresets = ["best"]\nframes = "ftorf31"': "all or ftorf13",
     "scenes = [": "Invalid",
 }
 

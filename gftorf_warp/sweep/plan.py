@@ -10,6 +10,7 @@ from typing import Any
 
 from ..data.texts import read_toml
 from ..errors import InputError, UsageError
+from ..evaluate.metrics import PROTOCOLS
 from ..recon import presets
 from ..sim.scenes import SCENES
 from ..sim.settings import SimSettings
@@ -192,6 +193,8 @@ def read_plan(path: str | Path) -> Plan:
         raise _wrong(path, "seeds", f"expected whole numbers from 0 on, found {seeds!r}")
     if (images := content.get("images")) is not None and images < 1:
         raise _wrong(path, "images", f"expected at least 1, found {images}")
+    if (frames := content.get("frames", "all")) not in PROTOCOLS:
+        raise _wrong(path, "frames", f"expected {' or '.join(PROTOCOLS)}, found {frames!r}")
     rows = tuple(_rows(content, path))
     single = content.get("one_seed", [])
     known = [*presets.PRESETS, *(row.name for row in rows)]
@@ -202,7 +205,7 @@ def read_plan(path: str | Path) -> Plan:
         seeds=tuple(dict.fromkeys(seeds)),
         images=images,
         one_seed=frozenset(single),
-        frames=content.get("frames", "all"),
+        frames=frames,
         simulate=_recording(content.get("simulate", {}), path),
         published=_published(content.get("published", {}), path),
     )
