@@ -20,6 +20,7 @@ from gftorf_warp.recon.closed_form import quads_of
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.runs.closed_form import ClosedForm
 from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.sensor import distance_from_phasor, phasor_from_quads
 
 REAL_ORDER = (1, 2, 0, 3)  # the time order of real F-ToeRF files
@@ -102,7 +103,7 @@ def test_a_shift_that_nobody_measured_is_computed(run):
     np.testing.assert_array_equal(turned[0], sequence.quads[4 + REAL_ORDER.index(0)])
 
 
-@pytest.mark.parametrize("change", ["pose", "size", "focal length"])
+@pytest.mark.parametrize("change", ["pose", "size", "focal length", "lens"])
 def test_another_view_is_refused(run, tmp_path, change):
     """A distance image has one place to look from."""
     pose = np.eye(4)
@@ -111,6 +112,7 @@ def test_another_view_is_refused(run, tmp_path, change):
         "pose": run.camera.at(pose),
         "size": run.camera.resized(24, 18),
         "focal length": replace(run.camera, fx=50.0),
+        "lens": replace(run.camera, distortion=Distortion(k1=-0.2)),
     }[change]
     with pytest.raises(UsageError, match="one view"):
         run.render(0.0, camera)

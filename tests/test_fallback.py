@@ -22,6 +22,7 @@ from gftorf_warp.recon.residuals import residuals
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import Rendering
+from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
 
@@ -150,6 +151,7 @@ def test_other_times_and_views_keep_the_fit(box):
         (99.0, found.camera),
         (13 / FRAME_RATE_HZ, found.camera),
         (inside, found.camera.at(aside)),
+        (inside, replace(found.camera, distortion=Distortion(k1=-0.2))),
     ):
         given = found.applied(wrong, time, camera)
         assert not given.source.any()

@@ -88,6 +88,8 @@ def another_view(sequence: Sequence, time: float, camera: Camera, sequence_camer
         for name in names
         if not math.isclose(getattr(camera, name), getattr(sequence_camera, name))
     ]
+    if camera.distortion != sequence_camera.distortion:
+        differ.append("lens")
     if differ:
         return ", ".join(differ)
     return f"pose, {apart:.3g} away from that of the quartet" if apart > POSE_TOLERANCE else ""
@@ -99,8 +101,8 @@ def check_camera(
     """Refuse every camera but the sequence's own.
 
     Raises:
-        UsageError: If ``camera`` has other intrinsics than ``sequence_camera``, or a pose far
-            from those of the quartet.
+        UsageError: If ``camera`` has other intrinsics or another lens than ``sequence_camera``, or
+            a pose far from those of the quartet.
     """
     if differs := another_view(sequence, time, camera, sequence_camera):
         raise UsageError(
