@@ -220,6 +220,8 @@ def test_a_run_with_the_setting_says_where_its_distance_is_from(runs, tmp_path):
     torch.testing.assert_close(given.distance[same], bare.distance[same])
     fast = run.renderer(("distance", "opacity", "source"))(9 / FRAME_RATE_HZ, run.camera)
     torch.testing.assert_close(fast.distance, given.distance)
+    alone = run.renderer(("opacity",))(9 / FRAME_RATE_HZ, run.camera)
+    torch.testing.assert_close(alone.opacity, given.opacity)
     render_to_folder(run, tmp_path / "out", ["distance"], [9 / FRAME_RATE_HZ])
     stored = read_exr(tmp_path / "out" / "distance" / "000000.exr")
     np.testing.assert_array_equal(stored["source"], given.source.numpy())

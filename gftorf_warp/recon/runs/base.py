@@ -31,7 +31,7 @@ from . import gaussians
 from .stored import StoredRun, at_frequency
 
 LOG = logging.getLogger("gftorf_warp")
-CORRECTED = {"distance", "quads", "phasor"}  # by the settings fallback and outlines
+CORRECTED = {"distance", "opacity", "quads", "phasor"}  # by the settings fallback and outlines
 KINDS: dict[str, type[Run]] = {}
 """The class of each method, and of ``windows``; ``recon/run.py`` fills it."""
 
