@@ -380,7 +380,7 @@ def test_a_volume_is_not_edited(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_contradictions_are_refused(tmp_path, name):
-    """Another input, an ablation, no weight of quads."""
+    """Another input, an ablation, no weight of quads, what corrects Gaussians."""
     sequence, other = recording(frames=8)[0], "quads" if name == "torf" else "phasor"
     for given, what in (
         ({"input": other}, "another input"),
@@ -388,6 +388,8 @@ def test_contradictions_are_refused(tmp_path, name):
         ({"ablation": "h1"}, "no ablations"),
         ({"changes": ["weights.quads=0"]}, "weights.quads"),
         ({"changes": ["volume.samples=1"]}, "volume.samples"),
+        ({"changes": ["fallback=True"]}, "fallback"),
+        ({"changes": ["outlines=True"]}, "outlines"),
         ({"settings": "ftorf", "changes": ["weights.colour=1"]}, "weights.colour"),
         ({"changes": [f"volume.network.static={name != 'torf'}"]}, "volume.network.static"),
     ):

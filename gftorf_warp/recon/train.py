@@ -155,6 +155,10 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why="it needs the flow of every raw frame, which no file contains",
             fix="use --flow dis or --flow deepflow",
         )
+    unfit = [name for name in ("fallback", "outlines") if getattr(settings, name)]
+    if unfit and settings.method != Method.GAUSSIANS:
+        what, why = f"{unfit[0]} does not fit preset {settings.preset}", "only Gaussians have it"
+        raise UsageError(what, where="--set", why=why, fix=f"leave {unfit[0]} out")
     wanted = None
     if settings.method.is_volume:
         wanted = Input.PHASOR if settings.method == Method.TORF else Input.QUADS
