@@ -3,6 +3,8 @@
 import pytest
 from small_runs import small
 
+from gftorf_warp.data.read import read
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import UsageError
 from gftorf_warp.evaluate import provenance
 from gftorf_warp.recon import presets
@@ -110,3 +112,13 @@ def test_a_run_keeps_what_was_changed(tmp_path):
     assert "--set rates.mean=0.002" in again
     with pytest.raises(UsageError, match="other settings"):
         reconstruct(small(), tmp_path / "run", "demo", images=4)
+
+
+def test_a_report_has_the_command_with_its_frame_rate(tmp_path):
+    """Without it the folder would be read with other times."""
+    write("ftorf", tmp_path / "box", small())
+    recorded = read(tmp_path / "box", frame_rate_hz=60.0)
+    run = reconstruct(recorded, tmp_path / "run", "ctof")
+    assert "--frame-rate 60.0" in provenance.how(run.config, None, "", compared={})
+    usual = reconstruct(tmp_path / "box", tmp_path / "usual", "ctof")
+    assert "--frame-rate" not in provenance.how(usual.config, None, "", compared={})

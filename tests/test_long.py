@@ -2,7 +2,9 @@
 
 import functools
 import gc
+import html
 import itertools
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.read import read, read_without_images
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.evaluate import provenance
 from gftorf_warp.evaluate.views import RENDERED, gather, views_to_take
 from gftorf_warp.export.command import export
 from gftorf_warp.recon.joined import Joined, Window, blended, folder_of
@@ -215,6 +218,16 @@ def test_commands_take_it_for_a_run(run, capsys, tmp_path):
     assert "windows/000" in capsys.readouterr().err
     with pytest.raises(UsageError, match="a run in windows"):
         run.save(tmp_path / "copy")
+
+
+def test_the_report_has_the_command_that_makes_the_same_windows(folder, run):
+    """With the images of one window."""
+    report = provenance.how(run.config, None, "", compared={})
+    words = shlex.split(html.unescape(report[report.index("gftorf reconstruct") :].splitlines()[0]))
+    given = dict(zip(words[3::2], words[4::2], strict=True))
+    assert int(given["--images"]) == IMAGES
+    again = plan(read_without_images(folder), float(given["--window"]), float(given["--overlap"]))
+    assert [one.stored for one in again] == run.config["windows"]
 
 
 def test_a_moved_recording_and_another_one(folder, run, tmp_path):

@@ -147,6 +147,12 @@ def _command(config: Mapping[str, Any]) -> str:
         options |= {name: value for name, value in more.items() if value is not None}
     else:
         del options["images"], options["seed"]
+    if windows := config.get("windows"):
+        options["images"] = config["settings"]["schedule"]["images"]  # of each of them
+        options["window"] = config.get("window_s", windows[0]["end_s"] - windows[0]["start_s"])
+        options |= {"overlap": seconds} if (seconds := config.get("overlap_s")) is not None else {}
+    if str(config.get("times") or "").startswith("setting"):
+        options["frame-rate"] = config["frame_rate_hz"]
     words = list(options.items())
     words += [("flow", config["flow"])] if config.get("flow") else []
     words += [("set", change) for change in config.get("changes") or ()]

@@ -41,6 +41,8 @@ OPTIONAL: dict[str, Any] = {
     "edited_from": str | None,
     "excerpt": list | None,
     "windows": list | None,
+    "window_s": NUMBER,
+    "overlap_s": NUMBER | None,
     "gaussians": int | None,
     "frame_rate_hz": NUMBER | None,
     "times": str | None,

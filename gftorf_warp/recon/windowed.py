@@ -78,6 +78,7 @@ def reconstruct_in_windows(
         return read(sequence, frame_rate_hz=frame_rate_hz, frames=windows[number].frames)
 
     config = _config(part(0), settings, windows, timing, seed=seed, device=device, **chosen)
+    config |= {"window_s": window_s, "overlap_s": overlap_s}
     with folder.locked(out):
         if not folder.prepare(out, config, fresh=fresh):
             folder.write_config(out, config)
