@@ -22,6 +22,8 @@ from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate import provenance
 from gftorf_warp.evaluate.views import RENDERED, gather, views_to_take
 from gftorf_warp.export.command import export
+from gftorf_warp.recon import presets
+from gftorf_warp.recon.folder import read_config
 from gftorf_warp.recon.joined import Joined, Window, blended, folder_of
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.recon.windowed import plan, reconstruct_in_windows
@@ -228,6 +230,21 @@ def test_the_report_has_the_command_that_makes_the_same_windows(folder, run):
     assert int(given["--images"]) == IMAGES
     again = plan(read_without_images(folder), float(given["--window"]), float(given["--overlap"]))
     assert [one.stored for one in again] == run.config["windows"]
+
+
+def test_a_run_in_windows_says_what_is_not_as_published(folder, tmp_path):
+    """As that of each of them."""
+    settings = presets.fast()
+    settings = replace(settings, init=replace(settings.init, count=8))
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        START(folder, tmp_path / "run", settings=settings, images=1, progress=stop)
+    assumed = read_config(folder_of(tmp_path / "run", 0))["assumed"]
+    assert assumed
+    assert read_config(tmp_path / "run")["assumed"] == assumed
 
 
 def test_a_moved_recording_and_another_one(folder, run, tmp_path):

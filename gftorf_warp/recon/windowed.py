@@ -25,6 +25,7 @@ from .loop import Progress
 from .record import log_to
 from .run import Run
 from .settings import ReconSettings
+from .suitable import faithfulness
 from .train import chosen_settings, reconstruct
 
 LOG = logging.getLogger("gftorf_warp")
@@ -185,7 +186,8 @@ def _config(
     """config.json before the first step: that of the first window, but for what windows add."""
     changes = list(changes)
     known = chosen_settings(first, settings, images, input, ablation, flow, changes)
-    return config_of(first, known, seed=seed, device=device) | {
+    stated = config_of(first, known, seed=seed, device=device) | faithfulness(known, changes)
+    return stated | {
         "flow": None if flow is None else str(flow),
         "changes": changes,
         "quad_scale": 1.0,  # images of windows are in the units of the sequence
