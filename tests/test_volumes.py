@@ -17,6 +17,7 @@ from waits import Operations
 
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.evaluate import provenance
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.export.command import export
 from gftorf_warp.recon import checkpoint, folder, presets
@@ -180,6 +181,14 @@ def test_a_run_is_rendered_compared_and_reported(tmp_path):
     page = (run.path / "report.html").read_text()
     assert "neural volume" in page
     assert "Gaussians start" not in page
+
+
+@pytest.mark.parametrize("name", ["ftorf", "volume"])
+def test_a_report_says_what_was_fitted_with_which_flow(name):
+    """Raw frames and optical flow, of both methods that read them."""
+    config = {"settings": {"method": name}, "input": "quads", "flow_source": "file"}
+    assert provenance.fact(config, "input") == "quads"
+    assert provenance.fact(config, "flow_source") == "file"
 
 
 def test_colour_is_fitted_in_every_other_step(tmp_path):

@@ -13,8 +13,8 @@ from . import page
 
 # facts that mean something for some methods only
 METHODS_OF = {
-    "input": {"gaussians", "torf", "ftorf"},
-    "flow_source": {"gaussians", "flow2d", "ftorf"},
+    "input": {"gaussians", "torf", "ftorf", "volume"},
+    "flow_source": {"gaussians", "flow2d", "ftorf", "volume"},
     "init": {"gaussians"},
     "motion": {"gaussians"},
 }
