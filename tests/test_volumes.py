@@ -183,6 +183,20 @@ def test_a_run_is_rendered_compared_and_reported(tmp_path):
     assert "Gaussians start" not in page
 
 
+def test_phasors_of_a_camera_change_halfway_between_two():
+    """Their raw frames are of one instant, not around the middle of a quartet."""
+    settings, period = toy("torf"), 4 / 120
+    targets = Targets(observe(as_phasors(recording(frames=8)[0]), settings, "cpu"))
+    volume = begin(settings, targets, 0, torch.device("cpu")).volume
+    rays = targets.views.rays(0, torch.arange(4))
+    depths = volume.depths(rays)
+    times = (0.0, 0.4 * period, 0.6 * period, period)
+    first, before, after, second = (volume.samples_at(t, rays, depths).alpha for t in times)
+    assert not torch.equal(first, second)
+    assert torch.equal(before, first)
+    assert torch.equal(after, second)
+
+
 @pytest.mark.parametrize("name", ["ftorf", "volume"])
 def test_a_report_says_what_was_fitted_with_which_flow(name):
     """Raw frames and optical flow, of both methods that read them."""

@@ -136,6 +136,7 @@ class Torf(Volume):
     def samples_at(self, time: float, rays: Rays, depths: Depths) -> Samples:
         """Samples of the quartet whose middle is nearest to a time [s]."""
         half = 0.5 * self.box.period * (1.0 - 1.0 / self.box.cycle)
+        half = 0.0 if self.box.simultaneous else half
         middles = np.array(self.box.quartet_times)[self.box.quartets] + half
         quartet = self.quartet(self.box.quartets[int(np.abs(middles - time).argmin())])
         return self._blended(rays, depths, quartet, None, colour=self.box.colour)

@@ -48,6 +48,8 @@ class Box:
     """Whether it has colour."""
     spread: tuple[float, float] = (0.0, 0.0)
     """Largest |x / z| and |y / z| in it [1], of a volume with grids."""
+    simultaneous: bool = False
+    """Whether the raw frames of a quartet are of one instant: the camera delivered phasors."""
 
 
 class Field(Protocol):
@@ -223,4 +225,5 @@ def box_of(targets: Targets, settings: VolumeSettings) -> Box:
         cycle=targets.cycle,
         reach=targets.observations.sensor.unambiguous_range,
         colour=targets.colour is not None,
+        simultaneous=sequence.from_phasors,
     )
