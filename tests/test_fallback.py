@@ -1,6 +1,7 @@
 """Where the measurement replaces the distance of a fit: renderings with known errors."""
 
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import torch
 from moving_box import recording, seen
 from small_runs import demo
 
-from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SOURCES
+from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SOURCES, SPEED_OF_LIGHT
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.data.temporal import agreement, averaged_locally
@@ -186,6 +187,24 @@ def test_one_phasor_is_enough_where_the_camera_moves(box, carried, factor):
     assert changes.sum() > 20
     assert ((source == FIT)[changes].mean() > 0.8) == (factor == 1.0)
     assert (source == FIT).mean() < 0.2
+
+
+def test_each_frequency_has_a_phasor_of_its_own(carried):
+    """Two frequencies leave half of eight quads to contradict their phasors: what one phasor of all
+    would just explain is not explained, and a fit that explains it stays.
+    """
+    wall, amplitude = seen(0)[0], 0.2  # [m], [quad units]
+    frequencies = np.repeat([60e6, 40e6], 4)[np.arange(FRAMES) % 8]
+    slopes = 4.0 * np.pi * frequencies / SPEED_OF_LIGHT
+    angles = slopes[:, None, None] * wall - carried.shifts[:, None, None]
+    tolerated = 1e-3 * amplitude  # of recordings without noise
+    quads = (amplitude * np.cos(angles) + math.sqrt(3.7) * tolerated).astype(np.float32)
+    stated = replace(carried.calibration, f_mod_hz=60e6, cycle_length=8)
+    changes = {"quads": quads, "frequencies_hz": frequencies, "calibration": stated}
+    several = replace(carried, **changes)
+    assert several.cycle == 8
+    assert not fallback_of(several, quads).moved.any()
+    assert fallback_of(several, 0.9 * quads).moved.all()
 
 
 def test_raw_frames_made_from_phasors_do_not_prove_the_closed_form(box, carried):

@@ -102,7 +102,8 @@ class Fallback:
         mean = np.stack([closed_form_distance(averaged, i) for i in quartets])
         of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
-        of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
+        unknowns = 2.0 * len(sequence.frequencies)
+        of_phasor *= sequence.cycle / (sequence.cycle - unknowns)
         odds = _odds(residuals.changing_unexplained_share, residuals)
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
