@@ -16,7 +16,7 @@ from volume_steps import Recorded, terms_of
 from waits import Operations
 
 from gftorf_warp.data.write import write
-from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.errors import DivergedError, InputError, UsageError
 from gftorf_warp.evaluate import provenance
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.export.command import export
@@ -351,6 +351,20 @@ def test_accumulated_steps_make_one_update(tmp_path):
         loop.step()
         changed.append(not torch.equal(before, state.volume.moving.density_head.weight))
     assert changed == [False, False, True, True]
+
+
+def test_a_volume_that_diverged_is_not_stored(tmp_path):
+    """A checkpoint that is due before the next row of metrics is not written: the one before stays
+    the last.
+    """
+    settings = toy("ftorf", images=10, rate=1e38, rays=8)
+    targets = targets_of(settings)
+    state = begin(settings, targets, 0, torch.device("cpu"))
+    with pytest.raises(DivergedError, match="not finite"):
+        loop_of(state, targets, settings, tmp_path).run()
+    stored = checkpoint.last(tmp_path)
+    assert stored["images"] == 0
+    assert all(bool(value.isfinite().all()) for value in stored["volume"]["weights"].values())
 
 
 def unfit(kind):

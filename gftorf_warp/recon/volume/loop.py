@@ -120,12 +120,7 @@ class VolumeLoop:
         torch._foreach_zero_(sums)
         state.counts.clear()
         if not math.isfinite(means["loss"]):
-            raise DivergedError(
-                "the optimisation diverged",
-                where=f"{self.out}, step {state.images}",
-                why="the loss is not finite; the last checkpoint is kept",
-                fix="lower the learning rate by --set volume.rate=1e-4 and start over with --fresh",
-            )
+            raise self._diverged("the loss is not finite")
         mse = means.pop("quad_mse", 0.0)
         psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
         row = {"images": state.images, "seconds": self.clock(), **means, "quad_psnr_db": psnr}
@@ -135,7 +130,21 @@ class VolumeLoop:
             self.progress(state.images, total, loss=row["loss"], psnr_db=psnr)
 
     def save(self) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint.
+
+        Raises:
+            DivergedError: If a parameter is not finite, before a row of metrics tells.
+        """
         state = self.state
+        if not all(bool(value.isfinite().all()) for value in state.volume.parameters()):
+            raise self._diverged("a parameter is not finite")
         state.seconds = self.saved_at = self.clock()
         checkpoint.save(self.out, state.to_dict())
+
+    def _diverged(self, why: str) -> DivergedError:
+        return DivergedError(
+            "the optimisation diverged",
+            where=f"{self.out}, step {self.state.images}",
+            why=f"{why}; the last checkpoint is kept",
+            fix="lower the learning rate by --set volume.rate=1e-4 and start over with --fresh",
+        )
