@@ -23,6 +23,7 @@ from gftorf_warp.data.lock import locked
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.evaluate import pictures
+from gftorf_warp.recon import checkpoint
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
 from gftorf_warp.sweep.command import sweep
@@ -283,13 +284,13 @@ with Workers([Place("cpu")], until_parent_ends) as workers:
 
 
 def test_a_job_whose_parent_was_killed_stops(swept, tmp_path, monkeypatch):
-    """Where its run can go on."""
+    """With a checkpoint of what it has done."""
     monkeypatch.setattr("gftorf_warp.sweep.job.parent_lives", lambda: False)
     plan = read_plan(swept[0] / "plan.toml")
     job = next(job for job in plan.fits if job.id == "box/demo-0")
     with pytest.raises(KeyboardInterrupt):
         do(Task(job=job, plan=plan, out=tmp_path), Place("cpu"))
-    assert [*(tmp_path / "runs" / job.id / "ckpt").glob("*.pt")]
+    assert checkpoint.last(tmp_path / "runs" / job.id)["images"] == 8
 
 
 def appears(path, patience_s=30.0):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import signal
 import time
 import traceback
 from collections.abc import Callable
@@ -151,7 +152,7 @@ def _while_parent_lives():
 
     def check(*_: object, **__: object) -> None:
         if not parent_lives():
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)  # what is fitted is stored before it ends
 
     return check
 
