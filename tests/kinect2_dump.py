@@ -1,5 +1,7 @@
 """Dumps of a Kinect v2 as libfreenect2 hands them out, written bit by bit from its layout."""
 
+import functools
+
 import numpy as np
 
 WIDTH, HEIGHT = 512, 424
@@ -49,6 +51,7 @@ def p0_response(steps):
     return b"".join(parts)
 
 
+@functools.cache
 def rays():
     """Where the ray through each pixel's centre is at z-depth 1, by fixed-point iteration."""
     row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -64,6 +67,7 @@ def rays():
     return x, y
 
 
+@functools.cache
 def tables():
     """The X and Z tables as bytes."""
     x, y = rays()
@@ -92,10 +96,15 @@ def quads_of(distance, steps, amplitude=4000.0):
     )
 
 
+@functools.cache
+def scene_codes():
+    """The codes that the sensor stores of the scene [9, 424, 512]."""
+    return code_of(quads_of(*scene()))
+
+
 def write(folder, *, tables_too=True, lookup=False, packets=1):
     """A folder of a dump of the scene; returns its codes."""
-    distance, steps = scene()
-    codes = code_of(quads_of(distance, steps))
+    codes, (_, steps) = scene_codes().copy(), scene()
     write_codes(folder, [codes] * packets, steps, tables_too=tables_too, lookup=lookup)
     return codes
 
