@@ -226,7 +226,8 @@ def command_parsers() -> dict[str, Parser]:
     render.option("--sequence", "SEQ", str, MOVED)
     what = "any of distance,distance_median,quads,phasor,colour (distance)"
     render.option("--what", "A,B", _list_of(str), what, ["distance"])
-    render.option("--times", "S,S", _list_of(_number), "seconds since raw frame 0 (each frame)")
+    moments = "seconds since raw frame 0 (each instant of the sequence)"
+    render.option("--times", "S,S", _list_of(_number), moments)
     poses = "world-to-camera matrices in a .npy file, or the sequence's novel views"
     render.option("--poses", "FILE|novel", str, f"{poses} (each frame's own pose)")
     render.flag(
@@ -243,7 +244,6 @@ def command_parsers() -> dict[str, Parser]:
     formats = "any of ply (Gaussians), points, mesh, obj, exr, npz, html, webm, mp4, gif, webp, "
     formats += "colmap, nerfstudio, tum"
     export.option("--format", "A,B", _list_of(str), f"{formats} (ply)", ["ply"], dest="formats")
-    moments = "seconds since raw frame 0 (each instant of the sequence)"
     export.option("--times", "S,S", _list_of(_number), moments)
     export.option("--every", "N", _positive, "every N-th instant of the sequence (1)", 1)
     colours = "of splats and points (colour if the run has any)"

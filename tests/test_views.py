@@ -48,6 +48,16 @@ def test_every_raw_frame_is_rendered_by_default(run, tmp_path):
     assert listed["preview"]["distance"]["unit"] == "m"
 
 
+def test_an_instant_of_several_raw_frames_is_rendered_once(run, tmp_path):
+    """A phasor recording has four raw frames of every instant; its images are no copies."""
+    measured = analytic_run.as_phasors(run.sequence())
+    run.sequence = lambda: measured
+    out = render_to_folder(run, tmp_path / "out", what="distance", arrays=True)
+    listed = json.loads((out / "renders.json").read_text())
+    assert listed["times_s"] == measured.times[::4].tolist()
+    assert len(np.load(out / "distance" / "distance.npy")) == measured.frames // 4
+
+
 def test_previews_of_all_times_share_a_scale(run, tmp_path):
     """The wall has one colour in every picture, and the picture is that of the values."""
     import cv2

@@ -214,8 +214,8 @@ def render_to_folder(
         run: A finished reconstruction.
         out: Folder, made if absent; one that holds these images is written again.
         what: Names out of distance, distance_median, quads, phasor, colour.
-        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets
-            included; with poses, the middle of the sequence.
+        times: Seconds since raw frame 0; None: the times of all raw frames, once each, truncated
+            quartets included; with poses, the middle of the sequence.
         poses: World-to-camera matrices, see scene/camera_paths.py, a .npy file of them [M, 4, 4] or
             [M, 3, 4], or ``novel``, those of the sequence. Image k is rendered from pose k at time
             k; the shorter list repeats.
@@ -366,7 +366,7 @@ def views_to_take(
 ) -> tuple[list[float], list[Camera]]:
     """Time [s] and camera of every image of :func:`render_to_folder`, whose arguments these are."""
     camera_poses = None if poses is None else read_poses(poses, sequence)
-    default = sequence.times if camera_poses is None else [middle(sequence)]
+    default = np.unique(sequence.times) if camera_poses is None else [middle(sequence)]
     seconds = [float(t) for t in (default if times is None else times)]
     if not seconds:
         why, fix = "the list is empty", "leave --times out"
