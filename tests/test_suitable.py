@@ -34,6 +34,8 @@ def unsuitable(kind):
     [
         ("dgs", "no colour", "no colour"),
         ("dgs_depth", "no colour", "no colour"),
+        ("ctof", "gaps", "no complete quartet"),
+        ("temporal", "gaps", "no complete quartet"),
         ("flow2d", "phasors", "no raw frames"),
         ("flow2d", "gaps", "no complete quartet"),
         ("temporal", "moving", "the camera moves"),
@@ -80,3 +82,10 @@ def test_check_names_what_is_assumed(tmp_path, capsys):
     found = capsys.readouterr()
     assert "sequence" in found.out
     assert "no colour" in found.err
+
+
+def test_check_says_that_there_is_no_closed_form(tmp_path, capsys):
+    """Of three raw frames no distance can be decoded."""
+    write("capture", tmp_path / "three", recording(frames=3, with_flow=False)[0])
+    assert main(["check", str(tmp_path / "three"), "--preset", "ctof"]) == 3
+    assert "no complete quartet" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from ..data.sequence import Sequence
 from ..data.synchronised import check_flow
 from ..data.temporal import camera_rests
 from ..errors import InputError
-from .closed_form import check_rests
+from .closed_form import check_rests, checked
 from .settings import Method, ReconSettings
 from .volume.models import VOLUMES
 from .volume.settings import PUBLISHED_STEPS
@@ -61,6 +61,8 @@ def check_sequence(sequence: Sequence, settings: ReconSettings) -> None:
             camera at rest where the method needs them.
     """
     method = settings.method
+    if method in (Method.CTOF, Method.TEMPORAL):
+        checked(sequence)
     if method == Method.TEMPORAL:
         check_rests(sequence)
     elif method == Method.FLOW2D:
