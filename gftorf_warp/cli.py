@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import __version__
-from .errors import ResourceError, UsageError
+from .errors import InputError, ResourceError, UsageError
 from .options import parse
 from .process import (
     available_cpus,
@@ -29,6 +29,8 @@ from .process import (
 )
 
 if TYPE_CHECKING:
+    from .data.report import Report
+    from .data.sequence import Sequence
     from .recon.run import Run
     from .sim.scene import Scene
 
@@ -381,7 +383,7 @@ def _opened(options: argparse.Namespace, device: str, path: str | None = None) -
 def _check(options: argparse.Namespace) -> int:
     from .data.check import check
 
-    print(check(options.sequence, options.sheet))
+    print(check(options.sequence, options.sheet, rules=[_lens]))
     if options.preset is not None:
         from .data.read import read
         from .recon.suitable import about_preset
@@ -391,6 +393,18 @@ def _check(options: argparse.Namespace) -> int:
         given = options.preset, None, "auto", None, None, ()
         print(about_preset(sequence, chosen_settings(sequence, *given)))
     return 0
+
+
+def _lens(sequence: Sequence, report: Report) -> None:
+    """Lens that folds inside the image, by the camera of a reconstruction."""
+    if sequence.intrinsics.distortion is None:
+        return
+    from .scene.measured import camera_of
+
+    try:
+        camera_of(sequence, 0)
+    except InputError as error:
+        report.warn("lens", f"{error.what}: {error.why}; {error.fix}")
 
 
 def _import(options: argparse.Namespace) -> int:

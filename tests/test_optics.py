@@ -283,6 +283,10 @@ def test_a_recording_of_a_lens_that_cannot_be_undone_is_bad_input(tmp_path, caps
     error = capsys.readouterr().err
     assert f"a lens that cannot be undone - {path}" in error
     assert "k1=-5.0" in error
+    assert main(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "a lens that cannot be undone" in said
+    assert "[lens]" in said
 
 
 @pytest.mark.parametrize("power", [-3.0, 4.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,12 +49,18 @@ IMAGES = (
 """Rules that need a complete quartet with light."""
 
 
-def check(path: str | Path, sheet: str | Path | None = None) -> Report:
+def check(
+    path: str | Path,
+    sheet: str | Path | None = None,
+    *,
+    rules: Iterable[Callable[[Sequence, Report], None]] = (),
+) -> Report:
     """Report on a sequence folder, with estimates that reveal a wrong order, offset or scale.
 
     Args:
         path: The folder.
         sheet: A picture (PNG) to write, with hypotheses on the order of the shifts.
+        rules: Further rules, which add what they find to the report.
 
     Raises:
         InputError: If the sequence cannot be read at all.
@@ -64,6 +71,8 @@ def check(path: str | Path, sheet: str | Path | None = None) -> Report:
     _facts(sequence, report)
     _assumptions(sequence, report)
     examine(sequence, report)
+    for rule in rules:
+        rule(sequence, report)
     if report.findings and (Path(path) / MANIFEST).is_file():
         why = "has the SHA-256 of every file: after a change of your own remove it"
         report.add("manifest", f"{MANIFEST} {why}, or the folder is refused")
