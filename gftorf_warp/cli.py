@@ -171,19 +171,22 @@ def _simulate(options: argparse.Namespace) -> int:
     from dataclasses import fields
 
     from .sim.closed_form_errors import ladder_table
+    from .sim.ladder import NAMES
     from .sim.settings import SimSettings
     from .sim.simulate import simulate, simulate_ladder
 
     device = start(options)
-    settings = SimSettings(**_named(options, *(field.name for field in fields(SimSettings))))
-    given = options.scene, options.out, settings
+    values = _named(options, *(field.name for field in fields(SimSettings)))
     where = {"device": device, "fresh": options.fresh}
     if not options.ladder:
+        given = options.scene, options.out, SimSettings(**values)
         print(simulate(*given, **where, progress=_progress(options)("simulate")))
         return 0
     if options.level is not None:
         why, fix = "--ladder records all of them", "leave one of the two out"
         raise UsageError("one level or all", where="--level", why=why, fix=fix)
+    values["level"] = NAMES[0]  # which decides about the engine, as all levels do alike
+    given = options.scene, options.out, SimSettings(**values)
     rows = simulate_ladder(*given, **where, progress=_each_level(options))
     print("\n".join(ladder_table(rows)))
     return 0

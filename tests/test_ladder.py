@@ -158,6 +158,13 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
     }
 
 
+def test_the_ladder_stores_all_truth(tmp_path):
+    """All its levels have the engine that computes it."""
+    words = "simulate demo --ladder --truth all --format capture --size 8x6 --frames 4 --paths 1"
+    assert main([*words.split(), "-q", "--out", str(tmp_path / "ladder")]) == 0
+    assert "normal" in Sequence.open(tmp_path / "ladder" / "L2").truth().layers
+
+
 def test_wrong_levels_are_refused(tmp_path, capsys):
     """By name, before anything is made; a ladder has no level of its own,
     and too few frames have no error.
