@@ -102,6 +102,7 @@ BAD = [
     ("demo --truth all", 2, "--engine mesh --format capture"),
     ("demo --truth most", 2, "usual, all"),
     ("demo --paths 0 --engine mesh --bounces 1", 2, "at least 1"),
+    ("demo --paths 8 --engine mesh", 2, "--bounces"),
     ("demo --exposure-samples 0", 2, "at least 1"),
 ]
 

@@ -50,7 +50,8 @@ class SimSettings:
     bounces: int | None = None
     """Surfaces that light may meet after the first; above 0 only with engine 'mesh'."""
     paths: int | None = None
-    """Random paths per pixel and raw frame for the light that bounces."""
+    """Random paths per pixel and raw frame for the light that bounces; needs ``bounces``, or a
+    level, which says how many."""
     format: str = "ftorf"
     """Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and
     truth of its first raw frame; 'capture', our own, which also holds any shifts, exposures,

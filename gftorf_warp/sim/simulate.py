@@ -25,7 +25,7 @@ from .resume import cached_images, needs_recording, set_aside
 from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene, named_scene
-from .settings import ResolvedSettings, SimSettings
+from .settings import ResolvedSettings, SimSettings, refuse
 
 
 def simulate(
@@ -73,6 +73,9 @@ def simulate(
     '# demo: simulated C-ToF sequence'
     """
     settings = replace(settings, **changes)
+    lost = settings.paths is not None and (settings.bounces, settings.level) == (None, None)
+    why, fix = "direct light needs none", "add --engine mesh --bounces 3, or leave --paths out"
+    refuse(lost, ("random paths of nothing", "--paths"), why, fix)
     requested = scene_of(scene, settings.overrides, settings.seed)
     settings = replace(settings, overrides=())
     recorded, used = resolved(requested, settings)
