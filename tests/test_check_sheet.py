@@ -52,6 +52,13 @@ def test_the_sheet_shows_hypotheses(tmp_path, capsys):
     assert with_hypotheses.std() > 10.0
 
 
+def test_a_sheet_by_the_name_of_another_format_is_refused(tmp_path, capsys):
+    """It would be a PNG that viewers take for something else."""
+    assert main(["check", str(tmp_path), "--sheet", str(tmp_path / "sheet.jpg")]) == 2
+    assert ".png" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_sheet_that_cannot_be_written_is_a_named_error(tmp_path, capsys):
     """A folder that does not exist: no traceback, nothing written."""
     folder = write("ftorf", tmp_path / "seq", mirrored())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
-from ..errors import InputError
+from ..errors import InputError, UsageError
 from . import findings, phase, reprojection, specs, timing, units
 from .capture_json import MANIFEST
 from .check_sheet import check_sheet
@@ -64,8 +64,11 @@ def check(
 
     Raises:
         InputError: If the sequence cannot be read at all.
-        UsageError: If the picture cannot be written there.
+        UsageError: If the picture cannot be written there, or its name is not that of a PNG.
     """
+    if sheet is not None and Path(sheet).suffix.lower() != ".png":
+        why, fix = "expected a name that ends in .png", f"for example {Path(sheet).stem}.png"
+        raise UsageError("not a PNG", where=sheet, why=why, fix=fix)
     sequence = read(path)
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
