@@ -2,6 +2,7 @@
 key.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,15 @@ def written(tmp_path, text, name="mine.toml"):
     path = tmp_path / name
     path.write_text(text)
     return path
+
+
+def test_a_full_well_may_be_without_limit(tmp_path):
+    """As by an override; other numbers are finite."""
+    sensor = "sensor = {{ noise = true, {} = inf }}\n"
+    scene = read_scene(written(tmp_path, sensor.format("full_well_electrons") + SHORT))
+    assert scene.sensor.full_well_electrons == math.inf
+    with pytest.raises(InputError, match="read_noise_electrons"):
+        read_scene(written(tmp_path, sensor.format("read_noise_electrons") + SHORT))
 
 
 def test_the_example_is_what_it_says():

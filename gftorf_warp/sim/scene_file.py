@@ -20,6 +20,7 @@ from ..errors import InputError
 from ..scene.sensor import Sensor
 from ..similar import did_you_mean
 from .assembly import Assembly, Level
+from .checks import UNLIMITED
 from .curves import Guided
 from .meshes import Mesh
 from .paths import Arc, Line, Path, Still, Sweep, Viewpoint
@@ -112,7 +113,8 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         return tuple(_value(one, item, path, f"{where}[{i}]") for i, (one, item) in pairs)
     if kind is FilePath and type(value) is str:
         return path.parent / value
-    if kind is float and type(value) in (int, float) and math.isfinite(value):
+    unlimited = where == UNLIMITED and value == math.inf
+    if kind is float and type(value) in (int, float) and (math.isfinite(value) or unlimited):
         return float(value)
     if kind is not float and type(value) is kind:  # a bool is an int to isinstance
         return value
