@@ -9,7 +9,7 @@ from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import FACES, Assembly, Level, Part
 from gftorf_warp.sim.bodies import chair
-from gftorf_warp.sim.gaussian_cover import clearance, cover_moving
+from gftorf_warp.sim.gaussian_cover import clearance, cover_moving, splats_of
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import still_interior
 from gftorf_warp.sim.scene import Scene
@@ -115,6 +115,24 @@ def test_a_wide_plate_near_the_camera_is_covered(shape):
     field = cover_moving(body, CAMERA, times).facing(np.zeros(3), 0.0)
     opacity = rasterize(field, CAMERA, Sensor()).opacity
     assert opacity[20:28, 8:56].min() > 0.98
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Plane(size=(0.7, 0.5)),
+        Box(size=(0.3, 0.5, 0.1)),
+        Sphere(radius=0.3),
+        Assembly(parts=(Part(shape=Sphere(radius=0.2)), Part(shape=Box(size=(0.4, 0.3, 0.3))))),
+    ],
+    ids=["plane", "box", "sphere", "assembly"],
+)
+def test_the_number_of_splats_is_known_before_they_are_made(shape):
+    """Which decides whether memory holds them."""
+    times, camera = np.array([0.0, 0.1]), Camera.from_fov(320, 2, 60.0)
+    body = Body(shape=shape, texture=GREY, path=Line(position=(0, 0, 2.3), velocity=(0, 0, -1)))
+    made = len(cover_moving(body, camera, times))
+    assert splats_of(body, camera, times, np.zeros((2, 3))) == pytest.approx(made, rel=0.05)
 
 
 def test_the_clearance_in_a_room_is_that_of_its_walls():

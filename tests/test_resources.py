@@ -74,6 +74,14 @@ def test_a_recording_that_does_not_fit_is_refused_at_once(tmp_path, capsys, opti
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("little")
+def test_covers_that_do_not_fit_are_refused(tmp_path, capsys):
+    """A wide image of two rows has few pixels and 200 million splats on its body that moves."""
+    words = ["simulate", "demo", "--size", "8000x2", "--frames", "4", "--out", str(tmp_path / "s")]
+    refused(words, capsys, "not enough memory", "--size", "--engine mesh", "1.00 GB are free")
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_disk_that_is_too_small_is_named(tmp_path, capsys, monkeypatch):
     """Before the first raw frame."""
     usage = namedtuple("usage", "total used free")

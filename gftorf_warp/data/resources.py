@@ -37,6 +37,11 @@ def to_simulate(frames: int, pixels: int, rays: int, *, traced: bool) -> Need:
     return Need(memory=memory, disk=frames * (12e3 + 24.0 * pixels))
 
 
+def to_cover(splats: float) -> Need:
+    """Splats that cover the moving bodies of a scene, and a rendering of those that are seen."""
+    return Need(memory=400.0 * splats)
+
+
 def to_read(frames: int, pixels: int) -> Need:
     """A sequence of F raw frames in memory, twice while it is read."""
     return Need(memory=8.0 * frames * pixels)

@@ -110,6 +110,11 @@ class Assembly(Shape):
         joined = (np.concatenate(arrays) for arrays in (moved, normals, others))
         return Grid(*joined, max(limbs))
 
+    @property
+    def grid_area(self) -> float:
+        """Of all parts."""
+        return sum(part.shape.grid_area for part in self.parts)
+
     @cached_property
     def reach(self) -> float:
         """Of the farthest part [m]."""

@@ -208,11 +208,7 @@ def cover_moving(
 
     ``centres`` [m] are positions of the camera at those times; None: that of ``camera``.
     """
-    local = _in_its_axes(body, camera.centre if centres is None else centres, times)
-    distances = body.shape.clearance(local)
-    outside = np.linalg.norm(local, axis=1) - body.shape.reach
-    if outside.min() > 0 and not isinstance(body.shape, Assembly):
-        distances = outside  # from the bounding sphere: a grid that is finer than it has to be
+    distances = _distances(body, camera.centre if centres is None else centres, times)
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
         why = f"clearance {nearest:.3f} m must be above 0"
@@ -236,6 +232,29 @@ def cover_moving(
         albedo=body.texture.albedo(point),
         body=body,
     )
+
+
+def splats_of(
+    body: Body,
+    camera: Camera,
+    times: Float[np.ndarray, "F"],
+    centres: Float[np.ndarray, "F 3"],
+) -> float:
+    """About how many splats :func:`cover_moving` makes, where there are many."""
+    nearest = _distances(body, centres, times).min()
+    return body.shape.grid_area * (camera.fx * magnification(camera) / (SPACING * nearest)) ** 2
+
+
+def _distances(
+    body: Body, centres: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
+) -> Float[np.ndarray, "F"]:
+    """Distance [m] of a body from a camera, for which a grid is fine enough."""
+    local = _in_its_axes(body, centres, times)
+    distances = body.shape.clearance(local)
+    outside = np.linalg.norm(local, axis=1) - body.shape.reach
+    if outside.min() > 0 and not isinstance(body.shape, Assembly):
+        return outside  # from the bounding sphere: a grid that is finer than it has to be
+    return distances
 
 
 def clearance(

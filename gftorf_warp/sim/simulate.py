@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..data import resources
 from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
@@ -18,6 +20,7 @@ from ..similar import did_you_mean
 from .card import outcome_card, settings_card
 from .checks import check_cameras, check_clearance, check_engine, check_format, check_numbers
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
+from .gaussian_cover import splats_of
 from .ladder import NAMES, resolved
 from .random_scene import PREFIX
 from .record import Progress, longest_times, record
@@ -85,6 +88,7 @@ def simulate(
     check_format(recorded, used)
     check_cameras(recorded, longest_times(recorded, used))
     check_clearance(recorded, longest_times(recorded, used))
+    _check_covers(recorded, used, Path(out))
     card = settings_card(requested, settings)
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
@@ -106,6 +110,20 @@ def _check_resources(scene: Scene, settings: ResolvedSettings, out: Path) -> Non
     traced = settings.engine == "mesh"
     need = resources.to_simulate(settings.frames, pixels, rays, traced=traced)
     resources.require(need, out, "use a smaller --size or fewer --frames")
+
+
+def _check_covers(scene: Scene, settings: ResolvedSettings, out: Path) -> None:
+    """Raise a ResourceError if memory cannot hold the splats on moving bodies, whose number depends
+    on the focal length in pixels, and not on the height of the image.
+    """
+    if settings.engine == "mesh":
+        return
+    times = longest_times(scene, settings)
+    centres = np.array([scene.camera(time=float(time)).centre for time in times])
+    camera = scene.camera(settings.size).finer(scene.subsamples)
+    moving = [body for body in scene.bodies if body.moves]
+    splats = sum(splats_of(body, camera, times, centres) for body in moving)
+    resources.require(resources.to_cover(splats), out, "use a smaller --size, or --engine mesh")
 
 
 def simulate_ladder(

@@ -64,6 +64,11 @@ class Shape(abc.ABC):
         )
 
     @property
+    def grid_area(self) -> float:
+        """Area that :meth:`grid` covers [m^2]; 0 if there is no grid."""
+        return 0.0
+
+    @property
     @abc.abstractmethod
     def reach(self) -> float:
         """Largest distance of the surface from the origin of its axes [m]."""
@@ -137,6 +142,12 @@ class Box(Shape):
         return Grid(np.concatenate(points), np.concatenate(normals), np.concatenate(others), 0.0)
 
     @property
+    def grid_area(self) -> float:
+        """Six faces."""
+        x, y, z = self.size
+        return 2.0 * (x * y + y * z + z * x)
+
+    @property
     def reach(self) -> float:
         """Half the diagonal [m]."""
         return float(np.linalg.norm(self.size)) / 2
@@ -179,6 +190,11 @@ class Plane(Shape):
         point = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
         normal = self.normal(point, np.zeros(len(point), dtype=np.int64))
         return Grid(point, normal, normal, 0.0)
+
+    @property
+    def grid_area(self) -> float:
+        """The rectangle."""
+        return self.size[0] * self.size[1]
 
     @property
     def reach(self) -> float:
@@ -224,6 +240,11 @@ class Sphere(Shape):
         # radius (1 - sin) = inset where the cosine is small
         limb = np.sqrt(min(0.5, 2.0 * inset / self.radius))
         return Grid(self.radius * normal, normal, normal, float(limb))
+
+    @property
+    def grid_area(self) -> float:
+        """The surface."""
+        return 4.0 * np.pi * self.radius**2
 
     @property
     def reach(self) -> float:
