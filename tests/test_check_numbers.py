@@ -61,6 +61,12 @@ def moving(step):
         ),
         (
             timing.time_unit,
+            {"times": np.arange(16) / 1e4},
+            {"times": np.arange(16) * 8.333e6},
+            "in nanoseconds? then multiply them by 1e-09",
+        ),
+        (
+            timing.time_unit,
             {"times": np.zeros(16)},
             {"times": np.arange(16) * 8e-6},
             "multiply them by 1000",

@@ -35,8 +35,9 @@ def time_unit(sequence: Sequence, report: Report) -> None:
     if low <= interval <= high:
         return
     unit, factor = ("milliseconds", 1e3) if interval > high else ("kiloseconds", 1e-3)
-    if interval / factor > high:
-        unit, factor = "microseconds", 1e6
+    for unit_below, further in (("microseconds", 1e6), ("nanoseconds", 1e9)):
+        if interval / factor > high:
+            unit, factor = unit_below, further
     report.warn(
         "time unit",
         f"raw frames are {interval:.4g} s apart, recordings of motion {low:g} to {high:g} s: times "
