@@ -86,6 +86,8 @@ BAD = [
     ("demo --override lens.falloff=nowhere.png", 3, "there is no such file"),
     ("demo --size 0x4", 2, "width and a height"),
     ("demo --size 12", 2, "96x72"),
+    ("demo --size 8193x1", 2, "at most 8192 pixels a side"),
+    ("tour --size 2x4097", 2, "at most 8192 pixels a side"),
     ("demo --frames -3", 2, "at least 1"),
     ("demo --seed x", 2, "whole number"),
     ("axial --frames 4000", 2, "nearer to the camera"),

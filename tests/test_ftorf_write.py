@@ -217,6 +217,7 @@ def poses_with(**changes):
         ({"phase_offset": float("nan")}, "calibration"),
         ({"quad_scale": 0.0}, "quad_scale"),
         ({"fx": 0.01}, "focal"),
+        ({"colour": {0: np.zeros((1, 8193, 3), np.float32)}}, "size"),
         ({"camera_from_world": poses_with(row=0, column=0, value=-1.0)}, "camera_from_world"),
         ({"camera_from_world": poses_with(row=3, column=0, value=1.0)}, "camera_from_world"),
         ({"colour": {0: np.full((2, 2, 3), np.inf)}}, "colour"),

@@ -15,6 +15,7 @@ from .calibration import FOCAL_MIN
 from .poses import rigid
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
+from .untrusted import FRAMES_MAX, SIDE_MAX
 
 
 def calibration_files(
@@ -125,6 +126,10 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         require(cycle == FRAMES_PER_QUARTET, "shifts", expected, f"of {cycle}")
         lens = tof.distortion
         require(lens is None, "distortion", "a pinhole", f"a lens with {lens}")
+    sides = (sequence.width, sequence.height, *_colour_size(sequence)[::-1])
+    require(max(sides) <= SIDE_MAX, "size", f"at most {SIDE_MAX} pixels a side", sides)
+    few = sequence.frames < FRAMES_MAX
+    require(few, "raw frames", f"fewer than {FRAMES_MAX}", sequence.frames)
     measured = sequence.measured
     require(measured.any(), "an empty sequence", "at least one measured raw frame", "none")
     finite, infinite = "finite numbers", "NaN or infinity"

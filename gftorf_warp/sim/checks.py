@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from ..data.cycles import QUADS_MIN
 from ..data.sequence import DEPTH_RANGES_M
+from ..data.untrusted import FRAMES_MAX, SIDE_MAX
 from ..errors import UsageError
 from .assembly import has_mesh
 from .gaussian_cover import clearance
@@ -120,6 +121,16 @@ def check_cameras(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
         except ValueError as error:
             what, fix = "a camera that cannot be placed", "choose another position or target"
             raise UsageError(what, where=where, why=str(error), fix=fix) from error
+
+
+def check_size(scene: Scene, settings: ResolvedSettings) -> None:
+    """Raise a UsageError if no reader would accept as large images, or as many."""
+    colour = scene.colour and scene.colour_camera(settings.size)
+    sides = settings.size if colour is None else (*settings.size, colour.width, colour.height)
+    got, few = "x".join(map(str, settings.size)), settings.frames < FRAMES_MAX
+    within = f"at most {SIDE_MAX} pixels a side, those of the colour camera too"
+    require(max(sides) <= SIDE_MAX, "--size", got, within)
+    require(few, "--frames", f"{settings.frames}", f"fewer than {FRAMES_MAX}")
 
 
 def check_clearance(scene: Scene, times: Float[np.ndarray, "F"]) -> None:

@@ -18,7 +18,14 @@ from ..data.write import write
 from ..errors import UsageError
 from ..similar import did_you_mean
 from .card import outcome_card, settings_card
-from .checks import check_cameras, check_clearance, check_engine, check_format, check_numbers
+from .checks import (
+    check_cameras,
+    check_clearance,
+    check_engine,
+    check_format,
+    check_numbers,
+    check_size,
+)
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
 from .gaussian_cover import splats_of
 from .ladder import NAMES, resolved
@@ -87,6 +94,7 @@ def simulate(
     check_engine(recorded, used, device)
     check_format(recorded, used)
     check_cameras(recorded, longest_times(recorded, used))
+    check_size(recorded, used)
     check_clearance(recorded, longest_times(recorded, used))
     _check_covers(recorded, used, Path(out))
     card = settings_card(requested, settings)
