@@ -133,6 +133,26 @@ def test_writing_is_undone_by_reading(folder):
     assert not list(folder.parent.glob(".*"))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_an_amplitude_that_could_not_be_read_is_not_written(tmp_path, value):
+    """Where it is unknown, the raw frame is not known."""
+    sequence, truth = recording()
+    truth.amplitude[3, 2, 1] = value
+    with pytest.raises(UsageError, match="amplitude"):
+        write("capture", tmp_path / "seq", sequence, truth)
+    truth.known[3] = False
+    write("capture", tmp_path / "seq", sequence, truth)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_tap_sum_that_could_not_be_read_is_not_written(tmp_path, value):
+    """As a quad that is no number."""
+    sums = {2: np.full((HEIGHT, WIDTH), value, np.float32)}
+    with pytest.raises(UsageError, match="tap_sums"):
+        write("capture", tmp_path / "seq", dataclasses.replace(recording()[0], tap_sums=sums))
+    assert not any(tmp_path.iterdir())
+
+
 def test_every_field_names_its_source_and_is_described(folder):
     """What a sequence holds is filled from described values,
     and the page beside the descriptions names all of them.

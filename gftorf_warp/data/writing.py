@@ -164,7 +164,14 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
     holds = not any(np.isinf(flow).any() for flow in flows)
     require(holds, "flow", "pixels, or NaN for unknown", "infinity")
+    if form == "capture":
+        sums = [image for n, image in sequence.tap_sums.items() if measured[n]]
+        require(all(np.isfinite(image).all() for image in sums), "tap_sums", finite, infinite)
     if truth is not None:
+        if truth.amplitude is not None and form == "capture":
+            light = truth.amplitude[truth.known]
+            holds = ((light >= 0) & (light < np.inf)).all()
+            require(holds, "amplitude", "finite numbers of 0 or more", "others")
         if truth.phasor_distance is not None:
             static = truth.phasor_distance[truth.known]
             holds = ((static >= 0) & (static < np.inf) | np.isnan(static)).all()
