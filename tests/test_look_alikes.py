@@ -46,8 +46,8 @@ def test_the_closed_form_fails_as_much_as_the_recipe_says(name):
 
 @pytest.mark.parametrize("name", GROUP_OF)
 def test_the_stored_errors_are_those_of_the_scene(name):
-    """At half the size, which takes a fifth of the time; the list of scenes says the first at full
-    size.
+    """T32: at half the size, which takes a fifth of the time; the list of scenes says the first at
+    full size.
     """
     row = STORED["scenes"][name]
     found = TABLE.errors(TABLE.half_size(SCENES[name]), GROUP_OF[name])
