@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from moving_box import recording
+from moving_box import recording, with_colour
 from sequences import changed
 from small_runs import FLOW, OneStep, advance, demo, small, weights_at
 
 from gftorf_warp.errors import InputError
 from gftorf_warp.recon import presets
-from gftorf_warp.recon.observations import ImageStack, data_hash, observe, reduced
+from gftorf_warp.recon.observations import ImageStack, data_hash, former_hash, observe, reduced
 from gftorf_warp.recon.settings import Batch, Weights
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.stepper import draw
@@ -139,6 +139,23 @@ def test_the_hash_sees_what_is_read():
         changed(sequence, backward_flow={}),
     ]
     assert len({data_hash(other) for other in (sequence, *others)}) == 4
+
+
+def test_the_hash_sees_the_lens_of_the_colour_camera():
+    """Fits read it; none is another lens than any, and the former hash of all is one."""
+    sequence = with_colour(small(), size=(12, 9))
+    colour = sequence.colour
+    bent = [
+        replace(colour.intrinsics, distortion=lens)
+        for lens in ((0.1, 0.0, 0.0, 0.0, 0.0), (0.2, 0.0, 0.0, 0.0, 0.0))
+    ]
+    others = [replace(sequence, colour=replace(colour, intrinsics=one)) for one in bent]
+    found = {data_hash(other) for other in (sequence, *others)}
+    former = {former_hash(other) for other in (sequence, *others)}
+    assert len(found) == 3
+    assert len(former) == 1
+    assert not found & former
+    assert former_hash(small()) is None
 
 
 def test_an_empty_recording_is_refused():

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moving_box import recording
+from moving_box import recording, with_colour
 from small_runs import advance, demo, rows, same, small, stored
 
+from gftorf_warp.data.read import read
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import BusyError, DivergedError, InputError, Terminated, UsageError
 from gftorf_warp.recon import checkpoint, folder, loop, presets, residuals
-from gftorf_warp.recon.observations import observe
+from gftorf_warp.recon.observations import data_hash, former_hash, observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, DensifySettings, Weights, plain
 from gftorf_warp.recon.state import begin, from_dict, to_dict
@@ -166,6 +168,22 @@ def test_a_folder_resumes_or_says_why_not(tmp_path):
     assert json.loads((run.path / "old-1" / "config.json").read_text())["seed"] == 1
     reconstruct(small(), run.path, demo(images=4), seed=3, fresh=True)
     assert sorted(p.name for p in run.path.glob("old-*")) == ["old-1", "old-2"]
+
+
+def test_a_run_with_the_former_hash_of_its_data_is_read_and_goes_on(tmp_path):
+    """It left out the lens of the colour camera; that of other data is refused."""
+    sequence = write("capture", tmp_path / "seq", with_colour(recording(frames=4)[0], size=(12, 9)))
+    run = reconstruct(sequence, tmp_path / "run", "ctof").path
+    config = folder.read_config(run)
+    assert config["data_sha256"] == data_hash(read(sequence))
+    folder.write_config(run, config | {"data_sha256": former_hash(read(sequence))})
+    assert Run.open(run).sequence().frames == 4
+    reconstruct(sequence, run, "ctof")
+    folder.write_config(run, config | {"data_sha256": former_hash(with_colour(small()))})
+    with pytest.raises(InputError, match="not the sequence of the run"):
+        Run.open(run).sequence()
+    with pytest.raises(UsageError, match="data_sha256"):
+        reconstruct(sequence, run, "ctof")
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path):

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from moving_box import recording
+from moving_box import recording, with_colour
 from sweep_work import Unloadable, die_once, pid, sleep
 
 from gftorf_warp.cli import main
@@ -24,6 +24,7 @@ from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.evaluate import pictures
 from gftorf_warp.recon import checkpoint
+from gftorf_warp.recon.observations import former_hash
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
 from gftorf_warp.sweep.command import sweep
@@ -87,6 +88,20 @@ def test_what_is_done_is_not_done_again(swept):
     last = json.loads(lines[-1])["id"]
     assert again[last]["metrics"] == results[last]["metrics"]
     assert all(json.loads(line) for line in store.read_text().splitlines())
+
+
+def test_a_result_with_the_former_hash_of_its_data_counts(tmp_path, monkeypatch):
+    """It left out the lens of the colour camera."""
+    write("capture", tmp_path / "box", with_colour(recording(frames=4)[0], size=(12, 9)))
+    plan = Plan(scenes=(Scene(name="box", sequence=tmp_path / "box"),), rows=(Row(preset="ctof"),))
+    task = Task(job=plan.fits[0], plan=plan, out=tmp_path / "out")
+    with monkeypatch.context() as former:
+        former.setattr("gftorf_warp.sweep.job.data_hash", former_hash)
+        stored = do(task, Place("cpu"))
+    again = do(replace(task, known=stored["key"]), Place("cpu"))
+    assert again["key"] == stored["key"]
+    assert "metrics" not in again
+    assert do(replace(task, known="another"), Place("cpu"))["key"] != stored["key"]
 
 
 def test_a_scene_that_a_lost_process_still_records_is_waited_for(swept, tmp_path):

@@ -29,8 +29,11 @@ IDENTITY = ("seed", "data_sha256", "windows")
 """What has to agree for a run to be continued, besides the settings."""
 
 
-def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
-    """Make the folder ready for a run with this config.
+def prepare(
+    run: Path, config: dict[str, object], *, fresh: bool, former: str | None = None
+) -> bool:
+    """Make the folder ready for a run with this config; ``former``: SHA-256 of the same data that
+    an older run states.
 
     Returns:
         True if it already holds this run, which is then continued; False if it is new.
@@ -61,7 +64,10 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     if fresh:
         set_aside(run, held)
         return False
-    differing = differences(read_config(run), config)
+    stated = read_config(run)
+    if former is not None and stated.get("data_sha256") == former:
+        stated["data_sha256"] = config["data_sha256"]
+    differing = differences(stated, config)
     if differing:
         raise UsageError(
             "the folder holds a run with other settings",

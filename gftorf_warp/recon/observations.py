@@ -276,6 +276,19 @@ def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
 
 def data_hash(sequence: Sequence) -> str:
     """SHA-256 of everything that a reconstruction reads from a sequence."""
+    return _data_hash(sequence, colour_lens=True)
+
+
+def former_hash(sequence: Sequence) -> str | None:
+    """What runs stated before their hash had the lens of the colour camera; None without such a
+    camera, of which nothing has changed.
+    """
+    if sequence.colour.intrinsics is None:
+        return None
+    return _data_hash(sequence, colour_lens=False)
+
+
+def _data_hash(sequence: Sequence, *, colour_lens: bool) -> str:
     digest = hashlib.sha256()
     arrays = {name: getattr(sequence, name) for name in HASHED}
     for name, array in (arrays | {"colour_from_world": sequence.colour.camera_from_world}).items():
@@ -289,6 +302,8 @@ def data_hash(sequence: Sequence) -> str:
     digest.update(repr(numbers).encode())
     if tof.distortion is not None:
         digest.update(repr(tof.distortion).encode())
+    if colour is not None and colour_lens:  # None too: former hashes of other lenses differ then
+        digest.update(repr(colour.distortion).encode())
     images = {"forward_flow": sequence.flow.forward, "backward_flow": sequence.flow.backward}
     images |= {"tap_sums": sequence.tap_sums}
     for name, by_frame in (images | {"colour": sequence.colour.images}).items():

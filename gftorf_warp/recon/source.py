@@ -13,7 +13,7 @@ from ..data.sequence import Sequence
 from ..errors import InputError, UsageError
 from . import folder
 from .joined import Window, folder_of
-from .observations import data_hash
+from .observations import data_hash, former_hash
 
 LOG = logging.getLogger("gftorf_warp")
 
@@ -87,7 +87,9 @@ def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
 def _check_hash(source: Path, run: Path, config: Mapping[str, Any], sequence: Sequence) -> None:
     """Raise an InputError if a sequence has another hash than the config of a run states."""
     wanted = config.get("data_sha256")
-    if wanted is not None and (actual := data_hash(sequence)) != wanted:
+    if wanted is None or wanted == (actual := data_hash(sequence)):
+        return
+    if wanted != former_hash(sequence):
         why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {actual[:12]}..."
         fix = "name the sequence of the run with --sequence SEQ, or reconstruct this one"
         raise InputError("not the sequence of the run", where=source, why=why, fix=fix)

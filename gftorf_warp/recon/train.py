@@ -26,7 +26,7 @@ from . import attempts, checkpoint, folder, presets, residuals, source
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
-from .observations import input_of, observe
+from .observations import former_hash, input_of, observe
 from .record import Metrics, log_to
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
@@ -109,7 +109,7 @@ def reconstruct(
     check_sequence(sequence, settings)
     _check_resources(sequence, settings, out, device)
     with folder.locked(out), on_device(device):
-        goes_on = folder.prepare(out, config, fresh=fresh)
+        goes_on = folder.prepare(out, config, fresh=fresh, former=former_hash(sequence))
         with log_to(out / "run.log"):
             _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)
         return Run.open(out, device)

@@ -20,7 +20,7 @@ from ..data.read import read
 from ..errors import BusyError, InputError
 from ..evaluate.compare import score
 from ..evaluate.panels import Comparison, row_to_show
-from ..recon.observations import data_hash
+from ..recon.observations import data_hash, former_hash
 from ..recon.settings import plain
 from ..recon.suitable import check_sequence
 from ..recon.train import chosen_settings, reconstruct
@@ -116,9 +116,13 @@ def _fitted(task: Task, place: Place) -> Result:
     chosen = job.row.arguments(plan.images)
     settings = chosen_settings(sequence, job.row.preset, **chosen)
     kind = torch.device(place.device).type
-    key = _hash(plain(settings), job.seed, data_hash(sequence), plan.frames, kind)
-    if key == task.known:
-        return {"key": key}
+
+    def key_of(data: str | None) -> str:
+        return _hash(plain(settings), job.seed, data, plan.frames, kind)
+
+    key = key_of(data_hash(sequence))
+    if task.known in (key, key_of(former_hash(sequence))):
+        return {"key": task.known}
     try:
         check_sequence(sequence, settings)
     except InputError as error:  # the row of a table that has another method's
