@@ -103,6 +103,12 @@ def test_a_shift_that_nobody_measured_is_computed(run):
     np.testing.assert_array_equal(turned[0], sequence.quads[4 + REAL_ORDER.index(0)])
 
 
+def test_a_frequency_that_nobody_measured_is_refused(run):
+    """By name, with those that were."""
+    with pytest.raises(ValueError, match=r"f_mod_hz 10000000 must be one of .*, 19986163\.9"):
+        run.render(0.0, f_mod_hz=10e6)
+
+
 @pytest.mark.parametrize("change", ["pose", "size", "focal length", "lens"])
 def test_another_view_is_refused(run, tmp_path, change):
     """A distance image has one place to look from."""

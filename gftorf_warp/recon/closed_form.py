@@ -40,6 +40,9 @@ def rendering_of(
     """The measured quartet nearest to a time [s] as a rendering, see :meth:`ClosedForm.render`."""
     quartet = nearest_quartet(sequence, time)
     decoded = decode_quartet(sequence, quartet)
+    if f_mod_hz is not None and f_mod_hz not in sequence.frequencies:
+        measured = ", ".join(f"{f:.9g}" for f in sequence.frequencies)
+        raise ValueError(f"f_mod_hz {f_mod_hz:.9g} must be one of those measured, {measured}")
     which = 0 if f_mod_hz is None else sequence.frequencies.index(f_mod_hz)
     re, im = decoded.phasors[which]
     size = (sequence.height, sequence.width)

@@ -39,11 +39,13 @@ class ClosedForm(WithoutGaussians):
                 complete one.
             camera: None, or the sequence's own at the time.
             extra: Channels per Gaussian, of which there are none.
-            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz], one of those that were
+                measured; None: the first of the sensor.
 
         Raises:
             InputError: If the sequence cannot be read again, or none of its quartets is complete.
             UsageError: If it is asked for from another camera.
+            ValueError: If nothing was measured at ``f_mod_hz``.
         """
         if camera is not None:
             closed_form.check_camera(self._measured, time, camera, self.camera, self.path)
