@@ -165,17 +165,30 @@ def test_the_table_has_means_spreads_and_what_others_published(swept):
 
 def test_a_picture_of_a_scene_has_all_rows_in_one_scale(swept):
     """Distances of truth, closed form and rows, errors below; a file, as on the page."""
-    folder, _ = swept
+    folder, results = swept
     plan = read_plan(folder / "plan.toml")
     for scene in plan.scenes:
         file = cv2.imread(str(folder / "out" / "pictures" / f"{scene.name}.png"))[..., ::-1]
-        np.testing.assert_array_equal(file, sheet(plan, scene, folder / "out"))
+        np.testing.assert_array_equal(file, sheet(plan, scene, folder / "out", results))
         with np.load(folder / "out" / "pictures" / scene.name / "demo-0.npz") as stored:
             distance, truth = stored["d"].astype(np.float32), stored["truth"].astype(np.float32)
         colours = pictures.colour_mapped(distance.copy(), pictures.distance_scale([truth]))
         factor = -(-320 // distance.shape[1])
         large = colours.repeat(factor, axis=0).repeat(factor, axis=1)
         assert shows(file, large), scene.name
+
+
+def test_a_picture_of_a_job_that_fails_now_is_left_out(swept):
+    """As its numbers are."""
+    folder, results = swept
+    plan, failed = read_plan(folder / "plan.toml"), {"error": "no memory", "exit_code": 5}
+    box = next(scene for scene in plan.scenes if scene.name == "box")
+    both, one, none = (
+        sheet(plan, box, folder / "out", results | dict.fromkeys(ids, failed))
+        for ids in ((), ("box/demo-0",), ("box/demo-0", "box/ctof-0"))
+    )
+    assert one.shape[1] < both.shape[1]
+    assert none is None
 
 
 def shows(picture, part):

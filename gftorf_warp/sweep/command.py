@@ -90,7 +90,7 @@ def sweep(
         wanted = {id: results[id] for id in every if id in results}
         write_json(out / NUMBERS, list(wanted.values()))
         atomic_write(out / TABLE, table.markdown(plan, wanted).encode())
-        sheets = {scene.name: sheet(plan, scene, out) for scene in plan.scenes}
+        sheets = {scene.name: sheet(plan, scene, out, wanted) for scene in plan.scenes}
         for name, picture in sheets.items():
             if picture is not None:
                 atomic_write(out / PICTURES / f"{name}.png", png_bytes(picture))

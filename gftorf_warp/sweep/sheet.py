@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..evaluate import pictures
 from ..evaluate.captioned import IN_A_ROW, Panel, Picture, captioned
-from .job import picture_of
+from .job import Result, picture_of
 from .plan import Job, Plan, Scene
 
 CLOSED_FORM = "closed form"
@@ -18,15 +18,16 @@ IN_A_LINE = 5  # [pictures] then the next line begins
 SIZE_MAX = 320  # [px] of an image
 
 
-def sheet(plan: Plan, scene: Scene, out: Path) -> Picture | None:
-    """Truth, closed form and all rows with their first seed; None without any image of a run.
+def sheet(plan: Plan, scene: Scene, out: Path, results: Mapping[str, Result]) -> Picture | None:
+    """Truth, closed form and all rows that are scored, with their first seed; None without any.
 
     All distances have one colour scale and all errors another, those of truth and closed form.
     """
+    jobs = {row.name: Job(scene=scene, row=row, seed=plan.seeds[0]) for row in plan.rows}
     images = {
-        row.name: stored
-        for row in plan.rows
-        if (stored := _stored(picture_of(Job(scene=scene, row=row, seed=plan.seeds[0]), out)))
+        name: stored
+        for name, job in jobs.items()
+        if "metrics" in results.get(job.id, {}) and (stored := _stored(picture_of(job, out)))
     }
     if not images:
         return None
