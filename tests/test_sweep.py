@@ -237,6 +237,17 @@ def test_a_job_that_fails_is_a_row_with_its_error(tmp_path):
     assert "What failed" in (tmp_path / "out" / "sweep.html").read_text()
 
 
+def test_a_fit_that_cannot_be_scored_is_not_begun(tmp_path):
+    """ftorf13 leaves out the first and the last quartet."""
+    write("ftorf", tmp_path / "box", *recording(frames=8))
+    scenes = (Scene(name="box", sequence=tmp_path / "box"),)
+    plan = Plan(scenes=scenes, rows=(Row(preset="demo"),), images=1, frames="ftorf13")
+    result = do(Task(job=plan.fits[0], plan=plan, out=tmp_path / "out"), Place("cpu"))
+    assert result["error"].startswith("protocol ftorf13 leaves no frame")
+    assert result["exit_code"] == 2
+    assert not (tmp_path / "out").exists()
+
+
 WRONG = {
     "scenes = []": "not empty",
     'scenes = ["demo"]': "presets",

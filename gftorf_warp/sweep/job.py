@@ -19,6 +19,7 @@ from ..data.files import atomic_path
 from ..data.read import read
 from ..errors import BusyError, InputError
 from ..evaluate.compare import score
+from ..evaluate.metrics import scored_frames
 from ..evaluate.panels import Comparison, row_to_show
 from ..recon.observations import data_hash, former_hash
 from ..recon.settings import plain
@@ -127,6 +128,7 @@ def _fitted(task: Task, place: Place) -> Result:
         check_sequence(sequence, settings)
     except InputError as error:  # the row of a table that has another method's
         return {"key": key, "refused": error.what, "why": error.why}
+    scored_frames(sequence, plan.frames)  # before a fit that cannot be scored
     chosen |= {"seed": job.seed, "device": place.device, "progress": _while_parent_lives()}
     folder, preset = run_of(job, task.out), job.row.preset
     forget_peak_memory(place.device)  # of the job before in this process
