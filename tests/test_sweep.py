@@ -27,7 +27,7 @@ from gftorf_warp.recon import checkpoint
 from gftorf_warp.recon.observations import former_hash
 from gftorf_warp.render.cuda import forget_peak_memory
 from gftorf_warp.sweep import table
-from gftorf_warp.sweep.command import sweep
+from gftorf_warp.sweep.command import read_results, sweep
 from gftorf_warp.sweep.job import Task, do
 from gftorf_warp.sweep.plan import Plan, Row, Scene, read_plan
 from gftorf_warp.sweep.sheet import sheet
@@ -88,6 +88,18 @@ def test_what_is_done_is_not_done_again(swept):
     last = json.loads(lines[-1])["id"]
     assert again[last]["metrics"] == results[last]["metrics"]
     assert all(json.loads(line) for line in store.read_text().splitlines())
+
+
+@pytest.mark.parametrize("damaged", ['{"id": "a"', "[]", '{"id": 3}', "{}", "null", "\x80"])
+def test_a_damaged_result_is_named_by_its_line(tmp_path, damaged):
+    """Not as if its job were not done; the last line, cut off by a crash, is."""
+    store = tmp_path / "results.jsonl"
+    good = '{"id": "box/ctof-0", "key": "k", "metrics": {}}\n'
+    store.write_text(f"{good}{damaged}\n{good}", encoding="latin-1")
+    with pytest.raises(InputError, match=r"(?s)results\.jsonl, line 2.*remove the line"):
+        read_results(store)
+    store.write_text(f"{good}{damaged}", encoding="latin-1")
+    assert [*read_results(store)] == ["box/ctof-0"]
 
 
 def test_a_result_with_the_former_hash_of_its_data_counts(tmp_path, monkeypatch):

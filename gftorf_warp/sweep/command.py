@@ -11,7 +11,7 @@ from typing import Any
 from ..data.files import atomic_write, write_json
 from ..data.images import png_bytes
 from ..data.lock import locked
-from ..errors import ResourceError, UsageError
+from ..errors import InputError, ResourceError, UsageError
 from . import table
 from .cluster import Cluster
 from .job import Result, Task, do
@@ -56,7 +56,7 @@ def sweep(
         Results by the id of their job. Those that failed have ``error``.
 
     Raises:
-        InputError: If the TOML file is no plan.
+        InputError: If the TOML file is no plan, or a stored result is damaged.
         UsageError: If the number of processes makes no sense, or there is no row of a name.
         ResourceError: If no scheduler answers.
         BusyError: If another sweep works in ``out``.
@@ -137,9 +137,31 @@ def _key(results: dict[str, Result], job: Job) -> str | None:
 
 
 def read_results(path: Path) -> dict[str, Result]:
-    """The last complete line of every job; none without the file."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-    return {r["id"]: r for r in (json.loads(line) for line in lines if line.endswith("\n"))}
+    """The last complete line of every job; none without the file.
+
+    Raises:
+        InputError: If another line than the last one is damaged.
+    """
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    results: dict[str, Result] = {}
+    for number, line in enumerate(lines, 1):
+        if line.endswith(b"\n"):
+            result = _read_line(line, path, number)
+            results[result["id"]] = result
+    return results
+
+
+def _read_line(line: bytes, path: Path, number: int) -> Result:
+    """One result."""
+    try:
+        result: Result = json.loads(line)
+        if isinstance(result["id"], str) and ("error" in result or "key" in result):
+            return result
+        why = "expected an object with an id and a key or an error"
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        why = f"expected the result of a job as JSON: {type(error).__name__}: {error}"[:200]
+    fix = "restore the file from a copy, or remove the line: its job is then scored again"
+    raise InputError("a damaged result", where=f"{path}, line {number}", why=why, fix=fix)
 
 
 def _store(path: Path, result: Result) -> None:
