@@ -20,12 +20,15 @@ from sequences import sequence_of
 from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.texts import read_rows
-from gftorf_warp.evaluate import controls, figures, page, panels, pictures, tables
+from gftorf_warp.evaluate import controls, figures, page, panels, pictures, provenance, tables
 from gftorf_warp.evaluate.compare import compare, comparison_of, summary
 from gftorf_warp.evaluate.gallery import colour_views, novel_views
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.report import report, verdict
 from gftorf_warp.evaluate.views import Views, gather
+from gftorf_warp.recon.settings import Method
+from gftorf_warp.scene.initialise import Init
+from gftorf_warp.scene.models import KINDS
 
 SLIDER = "document.querySelector('.slider')"
 VOID = {"img", "meta", "br", "input"}
@@ -451,6 +454,17 @@ def test_a_page_about_phasors_shows_phasors(compared):
     assert "phasor: real and imaginary part" in html.texts["How it was made"]
     assert "an MLP of position and time" in html.texts["How it was made"]
     assert "--input phasor" in html.texts["How it was made"]
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("init", Init), ("motion", KINDS), ("method", Method)]
+)
+def test_every_choice_has_words(name, values):
+    """None appears as a bare name."""
+    for value in values:
+        settings = {"method": str(value)} if name == "method" else {}
+        text = provenance.how({name: str(value), "settings": settings}, None, "", compared={})
+        assert f"<dd>{value}</dd>" not in text
 
 
 def test_verdict_says_which_is_better():

@@ -20,6 +20,8 @@ METHODS_OF = {
 }
 INIT_WORDS = {
     "phase": "phase: Gaussians start on surfaces decoded from the measured quads, not at random",
+    "quartets": "quartets: Gaussians at rest start on a background decoded from the measured "
+    "quads, moving ones on points measured in every quartet",
     "random": "random: Gaussians start at random points in view",
 }
 METHOD_WORDS = {
@@ -47,6 +49,12 @@ MOTION_WORDS = {
     "quartet, linear in between",
     "nodes": "nodes: Gaussians follow a few moving nodes with one offset per quartet, linear in "
     "between; no network",
+    "spline": "spline: Gaussians follow a few moving nodes along splines in time, with a control "
+    "point per quartet",
+    "rigid_nodes": "rigid_nodes: Gaussians follow a few nodes that rotate and move, with one "
+    "rotation and offset per quartet",
+    "windows": "windows: every quartet has moving Gaussians of its own, which move in a straight "
+    "line",
     "still": "still: nothing moves, a control",
 }
 FLOW_WORDS = {
