@@ -232,6 +232,15 @@ def test_the_report_has_the_command_that_makes_the_same_windows(folder, run):
     assert [one.stored for one in again] == run.config["windows"]
 
 
+def test_the_report_of_a_window_names_its_raw_frames_and_no_command(folder, run):
+    """`gftorf reconstruct` would take the whole recording."""
+    window = Run.open(folder_of(run.path, 1))
+    report = html.unescape(provenance.how(window.config, None, "", compared={}))
+    assert "gftorf reconstruct" not in report
+    assert f"# raw frames 8 to 23 of {str(folder.resolve())!r}" in report
+    assert "gftorf compare RUN" in report
+
+
 def test_a_run_in_windows_says_what_is_not_as_published(folder, tmp_path):
     """As that of each of them."""
     settings = presets.fast()

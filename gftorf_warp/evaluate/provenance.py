@@ -148,7 +148,14 @@ def _compare_command(metrics: Mapping[str, Any]) -> str:
 
 
 def _command(config: Mapping[str, Any]) -> str:
-    """The command that reproduces the run."""
+    """The command that reproduces the run; of an excerpt, for which there is none, what it is."""
+    if excerpt := config.get("excerpt"):
+        first, end = excerpt
+        return (
+            f"# raw frames {first} to {end - 1} of {str(config.get('sequence'))!r}, which no "
+            "command reconstructs alone: a window of a longer run comes from the command of that "
+            f"run, another excerpt from Sequence.open(..., frames=range({first}, {end}))"
+        )
     options = {name: config.get(name) for name in ("preset", "images", "seed", "device")}
     if Method(method_of(config)).fits:
         more = {name: fact(config, name) for name in ("ablation", "input")}
