@@ -5,6 +5,7 @@ import gc
 import html
 import itertools
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +21,11 @@ from gftorf_warp.data.read import read, read_without_images
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate import provenance
+from gftorf_warp.evaluate.caveats import caveats
 from gftorf_warp.evaluate.views import RENDERED, gather, views_to_take
 from gftorf_warp.export.command import export
-from gftorf_warp.recon import presets
-from gftorf_warp.recon.folder import read_config
+from gftorf_warp.recon import checkpoint, presets
+from gftorf_warp.recon.folder import read_config, write_config
 from gftorf_warp.recon.joined import Joined, Window, blended, folder_of
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.recon.windowed import plan, reconstruct_in_windows
@@ -220,6 +222,42 @@ def test_commands_take_it_for_a_run(run, capsys, tmp_path):
     assert "windows/000" in capsys.readouterr().err
     with pytest.raises(UsageError, match="a run in windows"):
         run.save(tmp_path / "copy")
+
+
+def test_a_damaged_checkpoint_of_a_window_is_named(run, tmp_path):
+    """With the images of the checkpoint before; without one, other windows are still rendered."""
+    shutil.copytree(run.path, tmp_path / "run")
+    window = folder_of(tmp_path / "run", 1)
+    last = window / "ckpt" / f"{IMAGES:010d}.pt"
+    before = checkpoint.save(window, checkpoint.load(last) | {"images": IMAGES - 4})
+    last.write_bytes(b"")
+    damaged = Run.open(tmp_path / "run")
+    late = 3 * IMAGES - 4
+    assert damaged.config["images_optimised"] == late < run.config["images_optimised"]
+    (caveat,) = caveats(damaged.config, damaged.sequence(), None)
+    assert f"windows/001/{last.name}" in caveat
+    assert f"image {late} of {3 * IMAGES}" in caveat
+    assert caveats(run.config, run.sequence(), None) == []
+    before.write_bytes(b"")
+    damaged = Run.open(tmp_path / "run")
+    assert damaged.render(0.0, run.camera.resized(16, 12)).distance.shape == (12, 16)
+    with pytest.raises(InputError, match="damaged checkpoint"):
+        damaged.render(damaged.joined.windows[1].middle)
+
+
+def test_a_fit_of_a_window_that_was_tried_again_is_named(run, tmp_path):
+    """As that of a run by itself."""
+    shutil.copytree(run.path, tmp_path / "run")
+    window = folder_of(tmp_path / "run", 2)
+    tried = [
+        {"attempt": number, "start": "init.kind phase", "unexplained_share": 0.5, "kept": kept}
+        for number, kept in ((1, False), (2, True))
+    ]
+    write_config(window, read_config(window) | {"attempts": tried})
+    opened = Run.open(tmp_path / "run")
+    (caveat,) = caveats(opened.config, opened.sequence(), None)
+    assert caveat.startswith("windows/002: The first fit failed")
+    assert caveat.endswith("fit 2 stays.")
 
 
 def test_the_report_has_the_command_that_makes_the_same_windows(folder, run):

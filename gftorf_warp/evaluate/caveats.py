@@ -26,7 +26,11 @@ def caveats(config: Mapping[str, Any], sequence: Sequence, truth: Truth | None) 
     sentences = [
         _damaged(config),
         _edited(config),
-        _tried_again(config),
+        _tried_again(config.get("attempts")),
+        *(
+            f"{window}: {_tried_again(attempts)}"
+            for window, attempts in config.get("attempts_of_windows", {}).items()
+        ),
         _beyond_range(sequence, truth),
     ]
     texts = [text for text in sentences if text]
@@ -50,9 +54,8 @@ def _edited(config: Mapping[str, Any]) -> str:
     return f"Its Gaussians were edited after the reconstruction in {source}." if source else ""
 
 
-def _tried_again(config: Mapping[str, Any]) -> str:
+def _tried_again(attempts: list[dict[str, Any]] | None) -> str:
     """About a fit that failed, and the one that followed it."""
-    attempts = config.get("attempts")
     if not attempts:
         return ""
     each = ", ".join(

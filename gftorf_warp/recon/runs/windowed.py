@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...errors import InputError
 from ...render.api import Rendering
 from ...render.inputs import DIFFERENTIABLE
 from ...scene.camera import Camera
 from ...scene.gaussians import GaussianField
 from .. import source
 from ..joined import Joined, Window, folder_of, refused
-from ..read_back import ReadBack
+from ..read_back import ReadBack, read_back
 from ..settings import Method
 from . import gaussians
-from .base import CORRECTED, Run
+from .base import CORRECTED, Run, newest
 from .empty import WithoutGaussians, with_empty_extra
 
 
@@ -48,7 +50,8 @@ class WindowedRun(WithoutGaussians):
             return replace(window, config=window.config | {"sequence": config["sequence"]})
 
         windows = [Window.of(stored) for stored in config["windows"]]
-        return cls._empty(path, described, device, joined=Joined(windows, opened))
+        reached = replace(described, config=config | _reached(path, len(windows)))
+        return cls._empty(path, reached, device, joined=Joined(windows, opened))
 
     @property
     def gaussians(self) -> int:
@@ -135,3 +138,28 @@ class WindowedRun(WithoutGaussians):
     def save(self, out: str | Path) -> Run:  # noqa: ARG002
         """Refused, as :meth:`edited`."""
         raise refused(self.path)
+
+
+def _reached(path: Path, count: int) -> dict[str, Any]:
+    """What the configs of all windows come to, with how far their newest readable checkpoints are:
+    sums, damaged checkpoints, and attempts by window.
+    """
+    configs = {}
+    for number in range(count):
+        window = folder_of(path, number)
+        described = read_back(window)
+        # closed forms have no checkpoint; without a readable one, the window is refused when needed
+        with suppress(InputError):
+            described = newest(window, described, "cpu")[1]
+        configs[window.relative_to(path).as_posix()] = described.config
+    sums = ("images_optimised", "seconds_reconstruct")
+    reached = {name: sum(config[name] for config in configs.values()) for name in sums}
+    damaged = [
+        f"{window}/{name}"
+        for window, config in configs.items()
+        for name in config.get("damaged_checkpoints", ())
+    ]
+    tried = {
+        window: config["attempts"] for window, config in configs.items() if config.get("attempts")
+    }
+    return reached | {"damaged_checkpoints": damaged, "attempts_of_windows": tried}
