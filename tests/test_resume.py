@@ -304,3 +304,10 @@ def test_an_old_run_goes_on_under_settings_that_it_is_too_old_to_know():
         replace(presets.released(), densify=replace(presets.released().densify, unseen_from=300))
     )
     assert folder.differences(old, new) == ["densify.unseen_from was None, now 300"]
+
+
+def test_a_volume_goes_on_without_settings_that_it_never_read():
+    """They are refused now; those of Gaussians were read."""
+    for preset, refused in ((presets.volume(), []), (demo(), ["failures_max was 2, now 5"])):
+        old = {"settings": plain(replace(preset, failures_max=2))}
+        assert folder.differences(old, {"settings": plain(preset)}) == refused

@@ -417,7 +417,7 @@ def test_a_volume_is_not_edited(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_contradictions_are_refused(tmp_path, name):
-    """Another input, an ablation, no weight of quads, what corrects Gaussians."""
+    """Another input, an ablation, no weight of quads, what corrects or repeats Gaussians."""
     sequence, other = recording(frames=8)[0], "quads" if name == "torf" else "phasor"
     for given, what in (
         ({"input": other}, "another input"),
@@ -427,11 +427,15 @@ def test_contradictions_are_refused(tmp_path, name):
         ({"changes": ["volume.samples=1"]}, "volume.samples"),
         ({"changes": ["fallback=True"]}, "fallback"),
         ({"changes": ["outlines=True"]}, "outlines"),
+        ({"changes": ["attempts_max=2"]}, "attempts_max"),
+        ({"changes": ["restarts_max=0"]}, "restarts_max"),
+        ({"changes": ["failures_max=2"]}, "failures_max"),
+        ({"changes": ["rollbacks_max=2"]}, "rollbacks_max"),
         ({"settings": "ftorf", "changes": ["weights.colour=1"]}, "weights.colour"),
         ({"changes": [f"volume.network.static={name != 'torf'}"]}, "volume.network.static"),
     ):
         with pytest.raises(UsageError, match=what):
-            reconstruct(sequence, tmp_path / "run", **({"settings": name} | given))
+            reconstruct(sequence, tmp_path / "run", **({"settings": name, "images": 1} | given))
     assert not (tmp_path / "run").exists()
 
 

@@ -15,7 +15,7 @@ from ..data import lock
 from ..data.files import json_text, sweep, write_json
 from ..data.texts import read_json
 from ..errors import InputError, UsageError
-from .settings import ReconSettings, plain
+from .settings import UNREAD, Method, ReconSettings, plain
 
 CONFIG = "config.json"
 SUM = "config_sha256"  # the key in it with the SHA-256 of all others
@@ -105,6 +105,8 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
             and isinstance(after, int)
             and after >= before
         ):
+            continue
+        if key in UNREAD and flat_new.get("method", Method.GAUSSIANS) != Method.GAUSSIANS:
             continue
         if before != after and key not in CHANGES_NOTHING:
             texts.append(f"{key} was {_short(before)}, now {_short(after)}")

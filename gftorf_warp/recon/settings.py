@@ -340,6 +340,12 @@ class ReconSettings:
             )
 
 
+UNREAD = ("attempts_max", "restarts_max", "failures_max", "rollbacks_max")
+GAUSSIANS_ONLY = ("fallback", "outlines", *UNREAD)
+"""Settings that no other method can change; there are runs that state those of ``UNREAD``, which no
+other method ever read."""
+
+
 def plain(settings: ReconSettings) -> dict[str, object]:
     """Settings as nested dictionaries of numbers, texts and None, as config.json holds them."""
     converted: dict[str, object] = _converted(dataclasses.asdict(settings))
