@@ -32,9 +32,10 @@ UNCHECKED = {
 # Files of more than 15 s, the longest first: what begins last must be short, or a core has
 # nothing to do meanwhile. xdist itself begins with the files of most tests.
 LONGEST = """
-    sweep accuracy look_alikes splat_distance reconstruct bounces listed_rows bench volumes
-    published_runs perceptron view stepper import_chain attempts rasterize cycles_recon random_scene
-    unfinished long processes
+    sweep reconstruct volumes splat_distance published_runs look_alikes accuracy listed_rows
+    bench stepper bounces import_chain rasterize lens long simulate view cycles_recon unfinished
+    resume best tensor_cores perceptron processes random_scene attempts moving_camera windows
+    collapse damaged_files planted_mistakes
     """.split()
 
 
