@@ -163,17 +163,26 @@ def test_gradients_of_the_network_agree_with_finite_differences():
     assert torch.autograd.gradcheck(values, (points, code), eps=1e-7, atol=1e-4)
 
 
-@pytest.mark.parametrize("several", [False, True])
-def test_a_product_is_that_of_a_linear_layer(several):
-    """And so are its gradients, with a bias of the layer or one for each of several parts."""
-    layer = torch.nn.Linear(5, 7, bias=not several).double()
-    rows = torch.rand(2, 6, 5, generator=generator(), dtype=torch.float64).requires_grad_()
-    biases = torch.rand(2, 7, generator=generator(1), dtype=torch.float64).requires_grad_()
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("added", [None, (2, 7), (2, 6, 7)])
+def test_a_product_is_that_of_a_linear_layer(added, relu):
+    """And so are its gradients, with a bias of the layer, one for each of several parts, or another
+    product added, and with a ReLU.
+    """
+    layer = torch.nn.Linear(5, 7, bias=added is None).double()
+    rows = torch.randn(2, 6, 5, generator=generator(), dtype=torch.float64).requires_grad_()
     weight = torch.rand(2, 6, 7, generator=generator(2), dtype=torch.float64)
-    values = linear(layer, rows, biases if several else None)
-    plain = layer(rows) + biases[:, None] if several else layer(rows)
+    if added is None:
+        values, plain, last = linear(layer, rows, relu=relu), layer(rows), layer.bias
+    else:
+        last = torch.rand(added, generator=generator(1), dtype=torch.float64).requires_grad_()
+        values = linear(layer, rows, last, relu=relu)
+        plain = layer(rows) + (last[:, None] if len(added) == 2 else last)
+    if relu:
+        assert plain.min() < -0.1
+        plain = torch.relu(plain)
     assert_close(values, plain)
-    leaves = [rows, layer.weight, biases if several else layer.bias]
+    leaves = [rows, layer.weight, last]
     ours = torch.autograd.grad((values * weight).sum(), leaves)
     theirs = torch.autograd.grad((plain * weight).sum(), leaves)
     assert min(each.abs().max() for each in theirs) > 0.1

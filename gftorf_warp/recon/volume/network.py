@@ -102,25 +102,31 @@ class VolumeNetwork(torch.nn.Module):
         """Values of points, in the units of the network, each at the time of its row."""
         dtype = precision_of(points)
         known = encoded(points, self.position_powers, columns=self._columns, dtype=dtype)
-        values = functional.relu(self._joined("0", known, codes))
+        values = self._joined("0", known, codes, relu=True)
         for name, layer in self.hidden.items():
             assert isinstance(layer, torch.nn.Linear)
-            product = linear(layer, values)
-            if name in self.entry:
-                product = product + self._joined(name, known, codes)
-            values = functional.relu(product)
+            joins = name in self.entry
+            added = self._joined(name, known, codes, layer.bias) if joins else layer.bias
+            values = linear(layer, values, added, relu=True)
         return values
 
     def _joined(
-        self, name: str, known: Float[Tensor, "T P e"], codes: Float[Tensor, "T C"] | None
+        self,
+        name: str,
+        known: Float[Tensor, "T P e"],
+        codes: Float[Tensor, "T C"] | None,
+        bias: Float[Tensor, "w"] | None = None,
+        *,
+        relu: bool = False,
     ) -> Float[Tensor, "T P w"]:
-        """The product of a layer with encoded positions and time codes."""
+        """The product of a layer with encoded positions and time codes, plus a bias: its own, or
+        that of what it is added to.
+        """
         entry = self.entry[name]
         assert isinstance(entry, torch.nn.Linear)
-        if codes is None:
-            return entry(known)
-        biases = self.time[name](codes)
-        return linear(entry, known, biases if entry.bias is None else biases + entry.bias)
+        bias = entry.bias if bias is None else bias
+        biases = bias if codes is None else self.time[name](codes) + bias
+        return linear(entry, known, biases, relu=relu)
 
     def density(self, trunk: Float[Tensor, "*n w"]) -> Float[Tensor, "*n"]:
         """Density before its ReLU [1/m]."""
