@@ -190,6 +190,22 @@ def test_a_picture_of_a_scene_has_all_rows_in_one_scale(swept):
         assert shows(file, large), scene.name
 
 
+def test_a_closed_form_that_is_nearly_right_does_not_hide_errors_of_others(swept, tmp_path):
+    """Errors of a millimetre in a scene 1 m deep are dark, not the end of the scale."""
+    folder, results = swept
+    plan = read_plan(folder / "plan.toml")
+    box = next(scene for scene in plan.scenes if scene.name == "box")
+    truth = np.tile(np.linspace(1.0, 2.0, 320), (240, 1))
+    right = {"truth": truth, "closed_form": truth, "closed_form_error": np.zeros_like(truth)}
+    path = tmp_path / "pictures" / "box"
+    path.mkdir(parents=True)
+    np.savez(path / "demo-0.npz", d=truth, error=np.full_like(truth, 1e-3), **right)
+    dark = pictures.colour_mapped(
+        np.full_like(truth, 1e-3), pictures.Scale(low=0.0, high=0.05, colours="magma", unit="m")
+    )
+    assert shows(sheet(plan, box, tmp_path, results), dark)
+
+
 def test_a_picture_of_a_job_that_fails_now_is_left_out(swept):
     """As its numbers are."""
     folder, results = swept
