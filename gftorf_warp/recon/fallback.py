@@ -14,7 +14,8 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
 
 A moving camera has no temporal mean, and its fits are worse: there the closed form replaces the
 distance of a pixel wherever one phasor explains its quads, or explains them as well as the fit
-does. Raw frames that were made from phasors are explained by one whatever moved, and prove nothing.
+does. Raw frames that were made from phasors are explained by one whatever moved: of a moving camera
+they are the closed form throughout, since nothing says where the fit is better.
 
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
 a fit between the two sides stays if it explains the quads. A slope is no step, however steep.
@@ -108,7 +109,7 @@ class Fallback:
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
-        if temporal.camera_rests(sequence) or sequence.from_phasors:
+        if temporal.camera_rests(sequence):
             needed = np.where(_supported(alone), odds, odds**2)
             needed = np.where(_is_useless(residuals, sequence, noise), 0.0, needed)
             moved = ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
