@@ -29,7 +29,7 @@ UNCHECKED = {
     """.split()
 }
 
-# Files of more than 15 s, the longest first: what begins last must be short, or a core has
+# The files that take longest, the longest first: what begins last must be short, or a core has
 # nothing to do meanwhile. xdist itself begins with the files of most tests.
 LONGEST = """
     sweep reconstruct volumes splat_distance published_runs look_alikes accuracy listed_rows

@@ -200,9 +200,10 @@ def test_a_closed_form_that_is_nearly_right_does_not_hide_errors_of_others(swept
     path = tmp_path / "pictures" / "box"
     path.mkdir(parents=True)
     np.savez(path / "demo-0.npz", d=truth, error=np.full_like(truth, 1e-3), **right)
-    dark = pictures.colour_mapped(
-        np.full_like(truth, 1e-3), pictures.Scale(low=0.0, high=0.05, colours="magma", unit="m")
-    )
+    distances = pictures.distance_scale([truth])
+    scale = pictures.error_scale([], least=0.05 * (distances.high - distances.low))
+    assert scale.high > 0.04, "a millimetre is dark"
+    dark = pictures.colour_mapped(np.full_like(truth, 1e-3), scale)
     assert shows(sheet(plan, box, tmp_path, results), dark)
 
 

@@ -45,9 +45,9 @@ def distance_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
     return Scale(low=low, high=max(high, low + 1e-3), colours="viridis", unit="m")
 
 
-def error_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
-    """A scale [m] from 0 to percentile 98 of errors, at least a millimetre."""
-    return Scale(low=0.0, high=max(_range(images, 0.0, 98.0)[1], 1e-3), colours="magma", unit="m")
+def error_scale(images: Iterable[Float[np.ndarray, "*n"]], least: float = 1e-3) -> Scale:
+    """A scale [m] from 0 to percentile 98 of errors, or to ``least`` [m] if that is more."""
+    return Scale(low=0.0, high=max(_range(images, 0.0, 98.0)[1], least), colours="magma", unit="m")
 
 
 def amplitude_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +39,10 @@ def sheet(plan: Plan, scene: Scene, out: Path, results: Mapping[str, Result]) ->
     if "closed_form_error" in first:
         errors = {CLOSED_FORM: first["closed_form_error"]} | errors
     scale = pictures.distance_scale([next(iter(distances.values()))])
-    error_scale = _error_scale(errors[CLOSED_FORM], scale) if CLOSED_FORM in errors else None
+    error_scale = None
+    if CLOSED_FORM in errors:  # which may be right in nearly all pixels
+        least = ERROR_MIN * (scale.high - scale.low)
+        error_scale = pictures.error_scale([errors[CLOSED_FORM]], least)
     lines, names = [], list(distances)
     for k in range(0, len(names), IN_A_LINE):
         some = names[k : k + IN_A_LINE]
@@ -67,12 +69,6 @@ def _error(
 ) -> Float[np.ndarray, "H W"]:
     """Error of a column; of the truth it is 0."""
     return errors[name] if name in errors else np.zeros_like(distances[name])
-
-
-def _error_scale(error: Float[np.ndarray, "H W"], distance: pictures.Scale) -> pictures.Scale:
-    """That of an error, unless nearly all of its pixels are right: it would show noise alone."""
-    scale = pictures.error_scale([error])
-    return replace(scale, high=max(scale.high, ERROR_MIN * (distance.high - distance.low)))
 
 
 def _panel(name: str, image: Float[np.ndarray, "H W"], scale: pictures.Scale) -> Panel:

@@ -105,9 +105,10 @@ class VolumeNetwork(torch.nn.Module):
         values = self._joined("0", known, codes, relu=True)
         for name, layer in self.hidden.items():
             assert isinstance(layer, torch.nn.Linear)
-            joins = name in self.entry
-            added = self._joined(name, known, codes, layer.bias) if joins else layer.bias
-            values = linear(layer, values, added, relu=True)
+            joined = None
+            if name in self.entry:
+                joined = self._joined(name, known, codes, layer.bias)
+            values = linear(layer, values, joined, relu=True)
         return values
 
     def _joined(

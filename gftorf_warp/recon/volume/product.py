@@ -57,8 +57,8 @@ class _Product(torch.autograd.Function):
                 torch._addmm_activation(one[0], part, weight.T, out=result)
             else:
                 torch.addmm(one, part, weight.T, out=result)
-        if relu and added.shape == out.shape:
-            out.relu_()
+                if relu:
+                    result.relu_()
         ctx.save_for_backward(rows, weight, out if relu else None)
         ctx.added = added.shape
         return out
