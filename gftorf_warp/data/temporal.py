@@ -19,7 +19,7 @@ from ..constants import SPEED_OF_LIGHT
 from .cycles import phase_noise
 from .decode import closed_form_distance, quartet_phasors
 from .kept import kept
-from .noise import QuadNoise, amplitudes_of, quad_noise
+from .noise import QuadNoise, amplitudes_of, median_amplitudes, median_of, quad_noise
 from .sequence import ColourCamera, Flow, Sequence
 
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
@@ -62,9 +62,8 @@ def agreement(sequence: Sequence) -> Bool[np.ndarray, "Q H W"]:
     agrees = np.zeros((len(quartets), sequence.height, sequence.width), dtype=bool)
     if noise is not None and camera_rests(sequence):
         stacked = stacked_quads(sequence)
-        light = np.median([amplitudes_of(sequence, i) for i in quartets], axis=0)
-        reach = AGREES * noise.sigma(light)
-        agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
+        reach = AGREES * noise.sigma(median_amplitudes(sequence))
+        agrees = (np.abs(stacked - median_of(stacked)) <= reach).all(axis=1)
         agrees &= agrees.sum(axis=0) >= AGREEING_MIN
     agrees.flags.writeable = False
     return agrees
@@ -117,7 +116,7 @@ def sigma_of_mean(
     """
     first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
     slot = first[0] % sequence.cycle
-    light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
+    light = median_amplitudes(sequence)
     relative = noise.sigma(light)[slot] / np.maximum(light[slot], np.finfo(np.float32).tiny)
     metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * sequence.frequencies[0])
     scale = phase_noise(sequence.shifts[first]) * metres_per_rad

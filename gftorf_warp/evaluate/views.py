@@ -16,6 +16,7 @@ from ..constants import SOURCES
 from ..data import resources, temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
+from ..data.threads import KeptThreads
 from ..errors import DivergedError, UsageError
 from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
@@ -107,6 +108,26 @@ def gather(
     chosen = sorted({n // sequence.cycle for n in frames})
     decoded = {i: decode_quartet(sequence, i) for i in chosen}
     quartets = [decoded[n // sequence.cycle] for n in frames]
+    with KeptThreads("gftorf-over-time", 1) as thread:  # while the device renders
+        over_time = thread.submit(_over_time, sequence, frames)
+        rendered = _rendered(run, sequence, frames, progress)
+    return Views(
+        frames=frames,
+        closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
+        over_time=over_time.result(),
+        quad_measured=sequence.quads[frames],
+        **_agreement(quartets),
+        **rendered,
+    )
+
+
+def _rendered(
+    run: Run,
+    sequence: Sequence,
+    frames: list[int],
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, np.ndarray]:
+    """The fields of :class:`Views` that are rendered."""
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("d", "opacity", "d_median", "d_tof", "quad_rendered")
     }
@@ -134,14 +155,7 @@ def gather(
             rows[name].append(finite(image, f"{name} of raw frame {n}", run))
         if progress is not None:
             progress(count, len(frames))
-    return Views(
-        frames=frames,
-        closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
-        over_time=_over_time(sequence, frames),
-        quad_measured=sequence.quads[frames],
-        **_agreement(quartets),
-        **{name: np.stack(images) for name, images in rows.items()},
-    )
+    return {name: np.stack(images) for name, images in rows.items()}
 
 
 def _over_time(sequence: Sequence, frames: list[int]) -> dict[str, Float[np.ndarray, "S H W"]]:
@@ -179,7 +193,7 @@ def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*imag
     Raises:
         DivergedError: If it is not finite.
     """
-    array = image.detach().cpu().numpy().astype(np.float32)
+    array = image.detach().cpu().numpy().astype(np.float32, copy=False)
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).sum())
         why = f"{bad} of {array.size} rendered values are NaN or infinite"

@@ -30,7 +30,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from ..constants import SOURCES
 from ..data.cycles import solution
 from ..data.decode import quartet_phasors
-from ..data.noise import amplitudes_of, quad_noise
+from ..data.noise import median_amplitudes, quad_noise
 from ..data.sequence import Sequence
 from ..data.temporal import averaged_or_locally
 from ..render.api import Rendering
@@ -118,8 +118,7 @@ class MeasuredPhasors:
         frames = quartet_phasors(sequence, quartets[0])[0][0]
         rows = solution(sequence.shifts[frames])
         assert rows is not None  # or the quartet would have no phasor
-        light = np.median([amplitudes_of(sequence, i) for i in quartets], axis=0)
-        of_quads = np.square(noise.sigma(light))
+        of_quads = np.square(noise.sigma(median_amplitudes(sequence)))
         variance = 0.5 * np.square(rows).sum() * of_quads.mean(axis=0) / count
 
         def tensor(image: np.ndarray, kind: torch.dtype) -> Tensor:
