@@ -8,10 +8,13 @@ import torch
 from moving_box import recording
 from small_runs import demo
 
+from gftorf_warp import simulate
 from gftorf_warp.constants import FRAME_RATE_HZ
+from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import outlines
+from gftorf_warp.recon.phasors import CLOSED_FORM, Phasor
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.scene.sensor import Sensor
@@ -46,7 +49,7 @@ def decoded(phasor):
     return phase / SENSOR.phase_slope
 
 
-def resolved(distance, phasor):
+def resolved(distance, phasor, source=None, **more):
     """Distance and source after resolving the outlines of a rendering."""
     none, flat = torch.zeros(0, *distance.shape), torch.zeros(0, distance.shape[1])
     images = torch.tensor(np.stack([phasor.real, phasor.imag, abs(phasor)]), dtype=torch.float32)
@@ -60,8 +63,9 @@ def resolved(distance, phasor):
         distance_median=flat,
         extra=None,
         screen=None,
+        source=source,
     )
-    given = outlines.resolved(rendering, SENSOR)
+    given = outlines.resolved(rendering, SENSOR, **more)
     return given.distance.numpy(), given.source.numpy()
 
 
@@ -92,6 +96,39 @@ def test_mixed_pixels_have_the_distance_at_their_centre(shape, distances):
     np.testing.assert_allclose(after[away], truth[away], atol=0.03 * (distances[1] - distances[0]))
     assert set(np.unique(source)) == {0, outlines.OUTLINE}
     assert (source == outlines.OUTLINE)[mixed].mean() > 0.9
+
+
+def test_the_closed_form_of_a_moving_camera_is_resolved_too():
+    """Its distance is first what the phasor of the run decodes to, here without the noise of the
+    measurement; of a camera at rest the closed form stays.
+    """
+    truth, phasor = scene(SHAPES["disc"], 2.0, 5.0)
+    noise = np.random.default_rng(0).normal(0.0, 0.05, truth.shape)
+    before = decoded(phasor) + noise
+    source = torch.full(truth.shape, CLOSED_FORM, dtype=torch.uint8)
+    stays, same = resolved(before, phasor, source)
+    np.testing.assert_allclose(stays, before, rtol=1e-6)
+    assert torch.equal(torch.tensor(same), source)
+    after, marked = resolved(before, phasor, source, camera_moves=True)
+    mixed = abs(decoded(phasor) - truth) > 1e-3
+    assert np.mean((after - truth)[mixed] ** 2) < 0.4 * np.mean((before - truth)[mixed] ** 2)
+    assert (marked == outlines.OUTLINE)[mixed].mean() > 0.9
+    away = ~mixed & (marked == CLOSED_FORM)
+    assert away.mean() > 0.7
+    np.testing.assert_allclose(after[away], truth[away], atol=1e-3)
+
+
+def test_a_phasor_decodes_to_the_turn_nearest_to_a_distance():
+    """Whole ranges of the frequency away, and never behind the camera."""
+    reach = 2.0 * math.pi / SENSOR.phase_slope
+    near = torch.tensor([[1.0, 1.2 + reach, 0.9 + 2.0 * reach, reach - 0.01]])
+    value = torch.polar(torch.ones(1, 4), SENSOR.phase_slope * torch.ones(1, 4) + 0.4)
+    value[0, 3] = torch.polar(torch.tensor(1.0), torch.tensor(SENSOR.phase_slope * 0.02 + 0.4))
+    zero = torch.zeros(1, 4)
+    phasor = Phasor(value=value, variance_re=zero, variance_im=zero, covariance=zero)
+    expected = torch.tensor([[1.0, 1.0 + reach, 1.0 + 2.0 * reach, 0.02 + reach]])
+    torch.testing.assert_close(phasor.decoded(near, SENSOR), expected)
+    assert phasor.decoded(torch.full((1, 4), -reach), SENSOR).min() == 0.0
 
 
 def test_a_slope_and_a_texture_are_no_outline():
@@ -152,3 +189,16 @@ def test_compare_scores_what_was_resolved(run):
     assert 0.0 < scores["source"]["outline"] < 0.2
     assert scores["d_fit_mse_x100"] != scores["d_mse_x100"]
     assert "outline" in (run.path / "report.html").read_text()
+
+
+def test_a_run_of_a_moving_camera_resolves_its_closed_form(tmp_path):
+    """Of phasors all of it is the closed form, of which mixed pixels change."""
+    sequence = simulate("tour", tmp_path / "tour", size=(48, 36), frames=8, format="torf")
+    run = reconstruct(sequence, tmp_path / "run", demo(images=8, outlines=True, fallback=True))
+    given = run.render(4 / FRAME_RATE_HZ, run.camera.at(run.sequence().camera_from_world[4]))
+    closed = torch.tensor(closed_form_distance(run.sequence(), 1), dtype=torch.float32)
+    resolved_here, stays = given.source == outlines.OUTLINE, given.source == CLOSED_FORM
+    assert 0.02 < resolved_here.float().mean() < 0.3
+    assert (resolved_here | stays).all()
+    assert (given.distance - closed).abs()[resolved_here].mean() > 0.05
+    assert (given.distance - closed).abs()[stays].median() < 0.03

@@ -31,7 +31,7 @@ from torch import Tensor
 from ..data.steps import STEP_M
 from ..render.api import Rendering
 from ..scene.sensor import Sensor
-from .phasors import Phasor, rendered_phasor
+from .phasors import CLOSED_FORM, Phasor, rendered_phasor
 from .straight import Outline, along_outline
 
 OUTLINE = 3  # in a map of sources, see fallback.py
@@ -50,22 +50,35 @@ LEAST = 1e-12  # [quad units] below it a neighbour is black
 MARGIN = 3  # [pixels] to the farthest neighbour
 
 
-def resolved(rendering: Rendering, sensor: Sensor, phasor: Phasor | None = None) -> Rendering:
+def resolved(
+    rendering: Rendering,
+    sensor: Sensor,
+    phasor: Phasor | None = None,
+    *,
+    camera_moves: bool = False,
+) -> Rendering:
     """A rendering with the distances of its mixed pixels resolved.
 
     Args:
         rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
         phasor: The phasor as well as it is known; None: as it is rendered.
+        camera_moves: Whether the closed form of a fallback is resolved too. First it is replaced by
+            what ``phasor`` decodes to, which has less noise.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
     """
     phasor = phasor or rendered_phasor(rendering)
-    fit = distance = rendering.distance
-    source = rendering.source
+    fit, source = rendering.distance, rendering.source
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
-    where = (source == 0) & (rendering.phasor[2] > 0.0)  # the others are measured, or black
+    lit = rendering.phasor[2] > 0.0
+    where = (source == 0) & lit  # the others are measured, or black
+    if camera_moves:
+        closed_form = (source == CLOSED_FORM) & lit
+        fit = torch.where(closed_form, phasor.decoded(fit, sensor), fit)
+        where |= closed_form
+    distance = fit
     for _ in range(PASSES):
         distance = _resolved(distance, phasor, where, sensor)
     changed = (distance - fit).abs() > 0.01 * STEP_M

@@ -35,7 +35,7 @@ from ..data.sequence import Sequence
 from ..data.temporal import averaged_or_locally
 from ..render.api import Rendering
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor, quad_from_phasor
+from ..scene.sensor import Sensor, distance_from_phasor, quad_from_phasor
 from . import closed_form
 
 MODEL_ERROR = 0.01  # of a rendered component at least, of the largest amplitude within 3x3 pixels
@@ -69,6 +69,14 @@ class Phasor:
             quads = quads + torch.stack([quad_from_phasor(*change, s) for s in sensor.shifts])
         phasor = torch.stack([value.real, value.imag, amplitude + longer])
         return replace(rendering, quads=quads, phasor=phasor)
+
+    def decoded(self, near: Float[Tensor, "H W"], sensor: Sensor) -> Float[Tensor, "H W"]:
+        """Distances of these phasors [m], whole ranges of the sensor's first frequency away so that
+        they are nearest to given ones [m].
+        """
+        alone = distance_from_phasor(self.value.real, self.value.imag, sensor)
+        period = 2.0 * math.pi / sensor.phase_slope
+        return (alone + period * torch.round((near - alone) / period)).clamp_min(0.0)
 
 
 def rendered_phasor(rendering: Rendering) -> Phasor:

@@ -150,7 +150,8 @@ class Run(StoredRun):
         if measured is not None:
             phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
         if self.config["settings"].get("outlines") and not light_only:
-            rendering = outlines.resolved(rendering, sensor, phasor)
+            moves = self.fallback is not None and self.fallback.camera_moves
+            rendering = outlines.resolved(rendering, sensor, phasor, camera_moves=moves)
         if phasor is None or self.fallback is None:
             return rendering
         return phasor.within(rendering, sensor)
