@@ -37,6 +37,7 @@ from gftorf_warp.evaluate.compare import (
 )
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import gather
+from gftorf_warp.recon import raw_frames
 
 PIXELS, BOX_PIXELS = 12 * 20, 6 * 4
 # seven columns see the box within a quartet, one of them all the time
@@ -186,17 +187,23 @@ def test_published_protocol(run):
     assert got["closed_form_mse_x100"] == pytest.approx(100 * error.mean(), rel=1e-4)
 
 
-def test_every_frame_is_rendered_at_its_own_pose(tmp_path):
-    """A camera that moves on by a centimetre each raw frame."""
+@pytest.mark.parametrize("fits", [True, False], ids=["once", "again"])
+def test_every_frame_is_rendered_at_its_own_pose(fits, tmp_path, monkeypatch):
+    """A camera that moves on by a centimetre each raw frame: rendered once for errors and residuals
+    if the images of all raw frames fit into memory.
+    """
+    if not fits:
+        monkeypatch.setattr(raw_frames, "KEPT_BYTES_MAX", 0)
+    steps = []
     run = AnalyticRun(tmp_path)
     poses = np.tile(np.eye(4), (14, 1, 1))
     poses[:, 0, 3] = 0.01 * np.arange(14)
     original = run.sequence
     run.sequence = lambda: replace(original(), camera_from_world=poses)
-    compare(run, report=False)
+    compare(run, report=False, progress=lambda *step: steps.append(step))
     taken = [camera.camera_from_world[0, 3] for camera in run.cameras]
-    # for its errors, and for its residuals
-    np.testing.assert_allclose(taken, [*poses[:12, 0, 3]] * 2)
+    np.testing.assert_allclose(taken, [*poses[:12, 0, 3]] * (1 if fits else 2))
+    assert steps == [(4, 24), (8, 24), (12, 24), *((n, 24) for n in range(13, 25))]
 
 
 def test_without_truth_errors_are_null(tmp_path):

@@ -69,8 +69,8 @@ def to_reconstruct_on_gpu(frames: int, pixels: int, gaussians: int) -> Need:
 
 
 def to_compare(frames: int, pixels: int) -> Need:
-    """Images of F scored raw frames with their errors, and a page."""
-    return Need(memory=150.0 * frames * pixels, disk=2e6)
+    """Images of F scored raw frames with their errors, renderings that are kept, and a page."""
+    return Need(memory=190.0 * frames * pixels, disk=2e6)
 
 
 def to_render(images: int, pixels: int, channels: int, *, arrays: bool, held: int) -> Need:

@@ -23,6 +23,7 @@ from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
 from ..recon import checkpoint, residuals
+from ..recon.raw_frames import RawFrames
 from ..render.buffers import available_threads
 from . import classes, gallery, views
 from . import metrics as measure
@@ -67,7 +68,8 @@ def compare(
         against: The true distance: ``geometry``, or ``static-phasor``, the closed form of a static,
             noise-free scene. Moving pixels are those of geometry in both cases.
         report: Whether to write the page as well.
-        progress: Called with (frames done, frames in all).
+        progress: Called with (steps done, steps in all): raw frames whose residuals are computed,
+            then those that are scored.
 
     Returns:
         The content of metrics.json; None where there is no truth or no such pixel.
@@ -119,17 +121,39 @@ def score(
     scored = measure.scored_frames(sequence, frames)
     need = resources.to_compare(len(scored), sequence.height * sequence.width)
     resources.require(need, run.path, "score fewer raw frames, --frames ftorf13")
-    gathered = views.gather(run, sequence, scored, progress=progress)
+    rendered = RawFrames(run, sequence, views.RENDERED, kept=True)
+    judging, scoring = _in_turn(progress, len(scored))
+    explained = residuals.explained(run, rendered, judging)  # first: the fallback needs it
+    gathered = views.gather(run, sequence, scored, rendered=rendered, progress=scoring)
     comparison = replace(
         comparison_of(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
-        residuals=run.explained,
+        residuals=explained,
         novel=gallery.novel_views(run, sequence) if novel else None,
     )
     residuals.warn(comparison.residuals)
     result = summary(run, comparison, protocol=frames, against=against)
     result["caveats"] = caveats(run.config, sequence, known)
     return result, comparison
+
+
+def _in_turn(
+    progress: Callable[[int, int], None] | None, count: int
+) -> tuple[Callable[[int, int], None], Callable[[int, int], None]]:
+    """Progress of the residuals, and after them of the ``count`` raw frames that are scored."""
+    judged = 0
+
+    def judging(done: int, total: int) -> None:
+        nonlocal judged
+        judged = total
+        if progress is not None:
+            progress(done, total + count)
+
+    def scoring(done: int, total: int) -> None:
+        if progress is not None:
+            progress(judged + done, judged + total)
+
+    return judging, scoring
 
 
 def _refuse_earlier_state(run: Run) -> None:

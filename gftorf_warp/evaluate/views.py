@@ -18,6 +18,7 @@ from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..data.threads import KeptThreads
 from ..errors import DivergedError, UsageError
+from ..recon.raw_frames import RawFrames
 from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
 from ..render.series import KEPT, View, on_host
@@ -98,32 +99,42 @@ def gather(
     sequence: Sequence,
     frames: list[int],
     *,
+    rendered: RawFrames | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Views:
     """Render raw frames n at their own times and poses, before a black background.
 
+    Args:
+        run: What is rendered.
+        sequence: Its sequence.
+        frames: The raw frames.
+        rendered: ``RawFrames(run, sequence, RENDERED)``, where others have used it; None: a new
+            one.
+        progress: Called with (frames done, frames in all).
+
     Raises:
         DivergedError: If a rendering is not finite.
     """
+    rendered = rendered or RawFrames(run, sequence, RENDERED)
     chosen = sorted({n // sequence.cycle for n in frames})
     decoded = {i: decode_quartet(sequence, i) for i in chosen}
     quartets = [decoded[n // sequence.cycle] for n in frames]
     with KeptThreads("gftorf-over-time", 1) as thread:  # while the device renders
         over_time = thread.submit(_over_time, sequence, frames)
-        rendered = _rendered(run, sequence, frames, progress)
+        images = _rendered(run, rendered, frames, progress)
     return Views(
         frames=frames,
         closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
         over_time=over_time.result(),
         quad_measured=sequence.quads[frames],
         **_agreement(quartets),
-        **rendered,
+        **images,
     )
 
 
 def _rendered(
     run: Run,
-    sequence: Sequence,
+    rendered: RawFrames,
     frames: list[int],
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, np.ndarray]:
@@ -131,13 +142,11 @@ def _rendered(
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("d", "opacity", "d_median", "d_tof", "quad_rendered")
     }
+    sequence = rendered.sequence
     first, *further = sequence.frequencies
-    renderers = {first: run.renderer(RENDERED, corrected=False)}
-    renderers |= {f: run.renderer(RENDERED, f_mod_hz=f, corrected=False) for f in further}
     for count, n in enumerate(frames, start=1):
-        time = float(sequence.times[n])
-        camera = camera_at(run, sequence, time)
-        light = {f: render(time, camera) for f, render in renderers.items()}
+        time, camera = float(sequence.times[n]), rendered.camera_at(n)
+        light = {f: rendered(n, f) for f in sequence.frequencies}
         fit, measured = light[first], light[float(sequence.frame_frequencies[n])]
         rendering = run.corrected(fit, time, camera)
         if rendering.source is not None:

@@ -12,9 +12,9 @@ quads are compared without their constant part, which phasors do not contain.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,10 +26,10 @@ from ..data.decode import quartet_phasors
 from ..data.noise import amplitudes_of
 from ..data.sequence import Sequence
 from ..render.api import Rendering
-from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of, quad_from_phasor
 from .compared import Compared
 from .observations import input_of
+from .raw_frames import Fitted, RawFrames
 from .settings import Input
 
 LOG = logging.getLogger("gftorf_warp")
@@ -43,27 +43,6 @@ CHANGING_MAX = 0.5  # of those that change, unexplained (0.1; 0.7)
 CONTRADICTED_MAX = 0.05  # of those that do not, at another distance (0.004; 0.13)
 CHANGING_MIN = 1e-3  # of all: noise alone makes 2e-4 of the pixels change
 CENTRAL = (0.05, 0.95)  # quantiles of the unexplained pixels that a message names
-
-
-class Fitted(Protocol):
-    """What is needed of a :class:`gftorf_warp.recon.run.Run`."""
-
-    @property
-    def config(self) -> dict:
-        """Content of config.json."""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of raw frame 0 at the sequence's own resolution."""
-
-    @property
-    def sensor(self) -> Sensor:
-        """The sensor, with the four canonical shifts."""
-
-    def renderer(
-        self, images: Iterable[str], *, f_mod_hz: float | None, corrected: bool
-    ) -> Callable[[float, Camera], Rendering]:
-        """A function of time [s] and camera."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,7 +124,11 @@ class Residuals:
 
 @torch.no_grad()
 def residuals(
-    run: Fitted, sequence: Sequence, compared: Compared | None = None
+    run: Fitted,
+    sequence: Sequence,
+    compared: Compared | None = None,
+    rendered: RawFrames | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Residuals | None:
     """Render every raw frame of all complete quartets of the run's sequence and compare.
 
@@ -153,6 +136,9 @@ def residuals(
         run: What was fitted.
         sequence: Its sequence, at its own size.
         compared: ``Compared.of(sequence, run.config)``, where it is known already.
+        rendered: Renderings with quads, phasor and distance that are used if they are of the size
+            of the fit; None: new ones.
+        progress: Called with (raw frames done, raw frames in all).
 
     Returns:
         None where there is nothing to compare, see :meth:`Compared.of`.
@@ -162,12 +148,11 @@ def residuals(
         return None
     measured, noise = compared.sequence, compared.noise
     phasors = input_of(measured, Input(run.config.get("input", Input.QUADS))) == Input.PHASOR
-    camera = run.camera.resized(measured.width, measured.height)
-    shown = ("quads", "phasor", "distance")
-    render = {f: run.renderer(shown, f_mod_hz=f, corrected=False) for f in sequence.frequencies}
+    if rendered is None or rendered.sequence.quads.shape != measured.quads.shape:
+        rendered = RawFrames(run, measured, ("quads", "phasor", "distance"))
     chi_square, scaled, distance = [], [], []
     for i in measured.complete_quartets:
-        apart, first = _quartet(run, measured, i, render, camera)
+        apart, first = _quartet(run, measured, i, rendered)
         distance.append(first)
         if phasors:
             apart = _without_constant(apart, measured, i)
@@ -177,6 +162,9 @@ def residuals(
         tolerated = np.maximum(variance + np.square(MODEL_ERROR * amplitude), TINY)
         chi_square.append((square / np.maximum(variance, TINY)).mean(axis=0))
         scaled.append((square / tolerated).mean(axis=0))
+        if progress is not None:
+            count = sequence.cycle * len(measured.complete_quartets)
+            progress(sequence.cycle * len(scaled), count)
     return Residuals(
         quartets=measured.complete_quartets,
         changes=compared.changes,
@@ -190,12 +178,25 @@ def residuals(
     )
 
 
+def explained(
+    run: Fitted, rendered: RawFrames, progress: Callable[[int, int], None] | None = None
+) -> Residuals | None:
+    """``run.explained``, which is then known, from renderings that others use too.
+
+    Args:
+        run: A :class:`gftorf_warp.recon.run.Run`.
+        rendered: Of its sequence, with quads, phasor and distance.
+        progress: Called with (raw frames done, raw frames in all).
+    """
+    known = vars(run)
+    if "explained" not in known:  # as functools.cached_property stores it
+        sequence = rendered.sequence
+        known["explained"] = residuals(run, sequence, rendered=rendered, progress=progress)
+    return known["explained"]
+
+
 def _quartet(
-    run: Fitted,
-    measured: Sequence,
-    i: int,
-    render: Mapping[float, Callable[[float, Camera], Rendering]],
-    camera: Camera,
+    run: Fitted, measured: Sequence, i: int, rendered: RawFrames
 ) -> tuple[Float[np.ndarray, "K H W"], Float[np.ndarray, "H W"]]:
     """Rendered minus measured quads of quartet i, each at its time, pose and frequency, and the
     distance [m] rendered at the first.
@@ -203,8 +204,7 @@ def _quartet(
     apart: list[Tensor] = []
     distance: list[Tensor] = []
     for n in range(measured.frames)[measured.quartet_frames(i)]:
-        at = camera.at(measured.camera_from_world[n])
-        rendering = render[float(measured.frame_frequencies[n])](float(measured.times[n]), at)
+        rendering = rendered(n, float(measured.frame_frequencies[n]))
         quad = quad_of_shift(rendering, run.sensor, float(measured.shifts[n]))
         apart.append(quad - torch.as_tensor(measured.quads[n], device=quad.device))
         if not distance:
