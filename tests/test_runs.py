@@ -43,7 +43,8 @@ def two(tmp_path_factory):
     runs[0].config["settings"] = {"rates": {"mean": 0.25, "motion": 1.0}}
     seen = []
     result = compare_runs(runs, folder / "out", progress=lambda *at: seen.append(at))
-    assert seen == [(k, 24) for k in range(1, 25)]
+    of_one = [4, 8, 12, *range(13, 25)]  # residuals by quartet, then every raw frame
+    assert seen == [(before + k, 48) for before in (0, 24) for k in of_one]
     return runs, folder / "out", result
 
 

@@ -44,7 +44,7 @@ def compare_runs(
     """Score runs of one sequence and write ``OUT/comparison.json`` and ``OUT/comparison.html``.
 
     Nothing is written into the folders of the runs. Arguments are those of
-    :func:`gftorf_warp.evaluate.compare.compare`; ``progress`` counts the frames of all runs.
+    :func:`gftorf_warp.evaluate.compare.compare`; ``progress`` counts the steps of all runs.
 
     Returns:
         The content of comparison.json: the sequence and its SHA-256, and the metrics.json of every
