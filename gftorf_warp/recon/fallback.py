@@ -15,7 +15,9 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
 A moving camera has no temporal mean, and its fits are worse: there the closed form replaces the
 distance of a pixel wherever one phasor explains its quads, or explains them as well as the fit
 does. Raw frames that were made from phasors are explained by one whatever moved: of a moving camera
-they are the closed form throughout, since nothing says where the fit is better.
+they are the closed form throughout, since nothing says where the fit is better. With the setting
+``outlines``, that closed form is decoded again from the phasor of the run and resolved where it
+mixes two surfaces, see outlines.py.
 
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
 a fit between the two sides stays if it explains the quads. A slope is no step, however steep.
