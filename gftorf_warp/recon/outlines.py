@@ -45,6 +45,7 @@ GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
 FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
 BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
 EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
+HALF = 0.5  # [1] of the change of a closed form that is kept
 ANY = 1.0 / math.pi  # density of any phasor in a unit disc
 LEAST = 1e-12  # [quad units] below it a neighbour is black
 MARGIN = 3  # [pixels] to the farthest neighbour
@@ -63,8 +64,9 @@ def resolved(
         rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
         phasor: The phasor as well as it is known; None: as it is rendered.
-        camera_moves: Whether the closed form of a fallback is resolved too. First it is replaced by
-            what ``phasor`` decodes to, which has less noise.
+        camera_moves: Whether the closed form of a fallback is resolved too, by half: what
+            ``phasor`` decodes to has less noise than the closed form, and where the odds are wrong,
+            a distance between two surfaces costs less than the wrong one of them.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
@@ -74,13 +76,14 @@ def resolved(
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
     lit = rendering.phasor[2] > 0.0
     where = (source == 0) & lit  # the others are measured, or black
+    closed_form = (source == CLOSED_FORM) & lit & camera_moves
     if camera_moves:
-        closed_form = (source == CLOSED_FORM) & lit
         fit = torch.where(closed_form, phasor.decoded(fit, sensor), fit)
         where |= closed_form
     distance = fit
     for _ in range(PASSES):
         distance = _resolved(distance, phasor, where, sensor)
+    distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
     changed = (distance - fit).abs() > 0.01 * STEP_M
     return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
 
