@@ -8,6 +8,7 @@ import urllib.request
 
 import numpy as np
 import pytest
+from browser import collect_sockets
 from simulated_recordings import FITTED, WRITERS
 
 from gftorf_warp import Sequence
@@ -42,6 +43,7 @@ def look_at(folder, typed, monkeypatch):
 
     monkeypatch.setattr(window.Window, "run", look)
     assert "open http://127.0.0.1:" in typed("view", folder, *CPU).out
+    collect_sockets()
     return seen
 
 

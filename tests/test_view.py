@@ -14,7 +14,7 @@ import analytic_run
 import numpy as np
 import pytest
 from analytic_run import OPACITY, QUAD_ERROR, AnalyticRun, box_at, quad, sequence, true_distance
-from browser import PATIENCE_S, browser
+from browser import PATIENCE_S, browser, collect_sockets
 
 from gftorf_warp import cli, reconstruct
 from gftorf_warp.constants import CANONICAL_SHIFTS
@@ -63,6 +63,7 @@ def window(analytic):
     found = Window(analytic)
     yield found
     found.close()
+    collect_sockets()
 
 
 def test_pictures_are_the_arrays_of_the_run(analytic):
@@ -334,6 +335,7 @@ def test_the_slider_moves_the_scene_in_a_browser(fitted):
             ended.set()
             drawing.join()
             window.close()
+    collect_sockets()
 
 
 def until(condition):
