@@ -10,8 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..data.steps import near_steps
-from ..data.threads import KeptThreads
-from ..render.buffers import available_threads
 from .metrics import DISTANCES, ERROR_UNIT
 
 SLOPES = (0.01, 0.02, 0.04)  # [m/px] bounds of the classes of slope
@@ -47,16 +45,13 @@ def class_errors(
     kinds = 1 + len(OF_SLOPE)
     label = class_of_pixels(truth) + kinds * static.astype(np.uint8)
     label[~(moving | static) | np.isnan(truth)] = 2 * kinds
-    labels = label.reshape(len(label), -1)
-    pixels = np.bincount(labels.ravel(), minlength=2 * kinds + 1)[: 2 * kinds].reshape(2, kinds)
-
-    def summed(error: Float[np.ndarray, "S H W"]) -> Float[np.ndarray, "l"]:
-        """By label; errors are NaN where the truth is unknown, which has the last one."""
-        frames = zip(labels, error.reshape(labels.shape), strict=True)
-        return np.sum([np.bincount(*frame, 2 * kinds + 1)[: 2 * kinds] for frame in frames], axis=0)
-
-    with KeptThreads("gftorf-classes", available_threads()) as threads:  # NumPy releases the GIL
-        sums = dict(zip(errors, threads.map(summed, errors.values()), strict=True))
+    flat = label.ravel()
+    pixels = np.bincount(flat, minlength=2 * kinds + 1)[: 2 * kinds].reshape(2, kinds)
+    sums = {
+        # errors are NaN where the truth is unknown, which have the last label
+        name: np.bincount(flat, error.ravel(), 2 * kinds + 1)[: 2 * kinds]
+        for name, error in errors.items()
+    }
     rows = {"interior": slice(1, kinds), EDGE: slice(0, 1)}
     rows |= {name: slice(k, k + 1) for k, name in enumerate(OF_SLOPE, start=1)}
     result: dict[str, dict[str, dict[str, float | None]]] = {}

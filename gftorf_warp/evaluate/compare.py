@@ -18,13 +18,11 @@ from ..data.files import atomic_write, write_json
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..data.texts import read_rows
-from ..data.threads import KeptThreads
 from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
 from ..recon import checkpoint, residuals
 from ..recon.raw_frames import RawFrames
-from ..render.buffers import available_threads
 from . import classes, gallery, views
 from . import metrics as measure
 from .caveats import caveats
@@ -215,10 +213,8 @@ def comparison_of(
     throughout = static & static_throughout(distance)
     if against != AGAINST[0]:
         distance = _static_phasor(sequence, truth)
-    scored, images = distance[gathered.frames], gathered.distances
-    with KeptThreads("gftorf-errors", available_threads()) as threads:  # NumPy releases the GIL
-        squared = threads.map(lambda image: measure.squared_error(image, scored), images.values())
-        errors = dict(zip(images, squared, strict=True))
+    scored, images = distance[gathered.frames], gathered.distances.items()
+    errors = {name: measure.squared_error(image, scored) for name, image in images}
     groups = {"moving": moving, "static": static, "throughout": throughout}
     judgement = Judgement(truth=scored, errors=errors, **groups)
     return Comparison(sequence=sequence, views=gathered, judgement=judgement)
@@ -271,26 +267,20 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
         group = {**unknown, "share": None}
         return {**unknown, **dict.fromkeys(GROUPS, group), "classes": None}
     moving, static, errors = judgement.moving, judgement.static, judgement.errors
-    everywhere = np.ones_like(moving)
-    with KeptThreads("gftorf-errors", available_threads()) as threads:  # NumPy releases the GIL
-        of_all = threads.submit(
-            measure.distance_errors, errors, everywhere, measure.mean_over_frames
-        )
-        of_groups = {
-            name: (threads.submit(measure.distance_errors, errors, mask), mask)
-            for name, mask in zip(GROUPS, (moving, static, judgement.throughout), strict=True)
-        }
-        by_class = classes.class_errors(errors, judgement.truth, moving, static)
     return {
-        **of_all.result(),
+        **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
         **{
             name: {
-                **of_group.result(),
+                **measure.distance_errors(errors, mask),
                 "share": measure.share(mask, (moving | static) & ~mask),
             }
-            for name, (of_group, mask) in of_groups.items()
+            for name, mask in zip(GROUPS, (moving, static, judgement.throughout), strict=True)
         },
-        "classes": {"step_m": steps.STEP_M, "edge_px": steps.EDGE_PX, **by_class},
+        "classes": {
+            "step_m": steps.STEP_M,
+            "edge_px": steps.EDGE_PX,
+            **classes.class_errors(errors, judgement.truth, moving, static),
+        },
     }
 
 

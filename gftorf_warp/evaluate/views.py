@@ -16,7 +16,6 @@ from ..constants import SOURCES
 from ..data import resources, temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
-from ..data.threads import KeptThreads
 from ..errors import DivergedError, UsageError
 from ..recon.raw_frames import RawFrames
 from ..recon.residuals import quad_of_shift
@@ -119,13 +118,11 @@ def gather(
     chosen = sorted({n // sequence.cycle for n in frames})
     decoded = {i: decode_quartet(sequence, i) for i in chosen}
     quartets = [decoded[n // sequence.cycle] for n in frames]
-    with KeptThreads("gftorf-over-time", 1) as thread:  # while the device renders
-        over_time = thread.submit(_over_time, sequence, frames)
-        images = _rendered(run, rendered, frames, progress)
+    images = _rendered(run, rendered, frames, progress)
     return Views(
         frames=frames,
         closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
-        over_time=over_time.result(),
+        over_time=_over_time(sequence, frames),
         quad_measured=sequence.quads[frames],
         **_agreement(quartets),
         **images,

@@ -126,7 +126,6 @@ class Residuals:
 def residuals(
     run: Fitted,
     sequence: Sequence,
-    compared: Compared | None = None,
     rendered: RawFrames | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Residuals | None:
@@ -135,7 +134,6 @@ def residuals(
     Args:
         run: What was fitted.
         sequence: Its sequence, at its own size.
-        compared: ``Compared.of(sequence, run.config)``, where it is known already.
         rendered: Renderings with quads, phasor and distance that are used if they are of the size
             of the fit; None: new ones.
         progress: Called with (raw frames done, raw frames in all).
@@ -143,7 +141,7 @@ def residuals(
     Returns:
         None where there is nothing to compare, see :meth:`Compared.of`.
     """
-    compared = compared or Compared.of(sequence, run.config)
+    compared = Compared.of(sequence, run.config)
     if compared is None:
         return None
     measured, noise = compared.sequence, compared.noise

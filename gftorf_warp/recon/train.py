@@ -17,14 +17,12 @@ from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..data.synchronised import has_tap_sums, unfilled_share
-from ..data.threads import KeptThreads
 from ..errors import InputError, UsageError
 from ..render.cuda import free_memory, on_device
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
 from . import attempts, checkpoint, folder, presets, residuals, source
-from .compared import Compared
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -305,30 +303,24 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     given = observations, settings, out, stored
     more = {"seed": seed, "clock": clock, "progress": progress}
     state: VolumeState | State
-    with KeptThreads("gftorf-compared", 1) as thread:  # while the device trains
-        compared = thread.submit(Compared.of, sequence, config)
-
-        def judge() -> residuals.Residuals | None:
-            return _judged(sequence, out, device, compared.result())
-
-        if settings.method.is_volume:
-            state = fit.fit(*given, **more)
-            judged = judge()
-        else:
-            state, judged = _fit_gaussians(sequence, *given, **more, judge=judge)
+    if settings.method.is_volume:
+        state = fit.fit(*given, **more)
+        judged = _judged(sequence, out, device)
+    else:
+        state, judged = _fit_gaussians(sequence, *given, **more)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
     attempts.conclude(out, config, vars(state), judged)
 
 
 def _judged(
-    sequence: Sequence, out: Path, device: torch.device | str, compared: Compared | None = None
+    sequence: Sequence, out: Path, device: torch.device | str
 ) -> residuals.Residuals | None:
     """Residuals of what is stored in the folder of a run."""
-    return residuals.residuals(Run.open(out, device), sequence, compared)
+    return residuals.residuals(Run.open(out, device), sequence)
 
 
 def _fit_gaussians(
-    sequence, observations, settings, out, stored, *, seed, clock, progress, judge
+    sequence, observations, settings, out, stored, *, seed, clock, progress
 ) -> tuple[State, residuals.Residuals | None]:
     """Train Gaussians until the images of the settings are used up, in as many attempts as it
     takes; the state that stays, and its residuals.
@@ -364,6 +356,9 @@ def _fit_gaussians(
         records = metrics, diagnostics, clock, progress
         first = attempts.seed_of(seed, state.attempt)
         return TrainingLoop(observations, chosen, first, out, *records).run(state)
+
+    def judge() -> residuals.Residuals | None:
+        return _judged(sequence, out, device)
 
     return attempts.run(state, settings, out, train=train, begin=begun, judge=judge)
 
