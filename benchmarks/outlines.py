@@ -31,6 +31,7 @@ from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
 from gftorf_warp.recon import outlines, phasors, straight
+from gftorf_warp.recon.raw_frames import RawFrames
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.sim.random_scene import random_scene
@@ -59,20 +60,15 @@ def fit(out: Path, folder: Path, images: int) -> None:
 def renderings_of(run: Run) -> list[tuple[int, Rendering]]:
     """Raw frames with their renderings after the fallback, before outlines."""
     sequence, found = run.sequence(), []
-    render = run.renderer(("distance", "phasor", "opacity"), corrected=False)
-    for n in scored_frames(sequence)[FIRST::EVERY]:
-        time = float(sequence.times[n])
-        camera = camera_at(run, sequence, time)
-        rendering = render(time, camera)
+    frames = scored_frames(sequence)[FIRST::EVERY]
+    rendered = RawFrames(run, sequence, ("distance", "phasor", "opacity"), kept=frames)
+    for n in frames:
+        rendering = rendered(n, float(sequence.frame_frequencies[n]))
         if run.fallback is not None:
+            time, camera = float(sequence.times[n]), rendered.camera_at(n)
             rendering = run.fallback.applied(rendering, time, camera)
-        kept = {name: _copy(image) for name, image in vars(rendering).items()}
-        found.append((n, Rendering(**kept)))
+        found.append((n, rendering))
     return found
-
-
-def _copy(image: Any) -> Any:
-    return image.clone() if isinstance(image, torch.Tensor) else image
 
 
 def errors(stored: Stored, resolved: Callable[[int, Rendering], torch.Tensor]) -> dict[str, float]:

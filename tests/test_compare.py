@@ -193,7 +193,7 @@ def test_every_frame_is_rendered_at_its_own_pose(fits, tmp_path, monkeypatch):
     if the images of all raw frames fit into memory.
     """
     if not fits:
-        monkeypatch.setattr(raw_frames, "KEPT_BYTES_MAX", 0)
+        monkeypatch.setattr(raw_frames, "RENDERINGS_KEPT_MAX", 0)
     steps = []
     run = AnalyticRun(tmp_path)
     poses = np.tile(np.eye(4), (14, 1, 1))

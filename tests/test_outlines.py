@@ -111,6 +111,7 @@ def test_the_closed_form_of_a_moving_camera_is_resolved_too():
     assert torch.equal(torch.tensor(same), source)
     after, marked = resolved(before, phasor, source, camera_moves=True)
     mixed = abs(decoded(phasor) - truth) > 1e-3
+    # half of the change leaves a quarter of the squared error where it is right
     assert np.mean((after - truth)[mixed] ** 2) < 0.4 * np.mean((before - truth)[mixed] ** 2)
     assert (marked == outlines.OUTLINE)[mixed].mean() > 0.9
     away = ~mixed & (marked == CLOSED_FORM)

@@ -82,18 +82,8 @@ def amplitudes_of(sequence: Sequence, i: int) -> Float[np.ndarray, "K H W"]:
 
 @kept
 def median_amplitudes(sequence: Sequence) -> Float[np.ndarray, "K H W"]:
-    """Median over all complete quartets of the amplitude of every slot [quad units]; read-only."""
-    by_quartet = [amplitudes_of(sequence, i) for i in sequence.complete_quartets]
-    slots = 1 if len(sequence.frequencies) == 1 else sequence.cycle  # one phasor: all are alike
-    light = median_of(np.stack([amplitude[:slots] for amplitude in by_quartet]))
-    return np.broadcast_to(light, by_quartet[0].shape)
-
-
-def median_of(images: Float[np.ndarray, "n *image"]) -> Float[np.ndarray, "*image"]:
-    """``np.median`` along the first axis, of images without NaN, in a third of its time."""
-    ordered = np.sort(images, axis=0)
-    half = len(ordered) // 2
-    return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
+    """Median over all complete quartets of the amplitude of every slot [quad units]."""
+    return np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
 
 
 def _high_pass(images: Float[np.ndarray, "K H W"]) -> Float[np.ndarray, "K h w"]:
@@ -110,8 +100,7 @@ def _line(residual: Float[np.ndarray, "n"], amplitude: Float[np.ndarray, "n"]) -
     overall = float(np.median(np.abs(residual)) / MEDIAN) ** 2
     if bins < 2 or overall == 0.0:
         return overall, 0.0
-    ends = np.arange(1, bins) * len(residual) // bins
-    parts = np.split(np.argpartition(amplitude, ends), ends)
+    parts = np.array_split(np.argsort(amplitude), bins)
     light = np.array([amplitude[part].mean() for part in parts])
     variance = np.array([(np.median(np.abs(residual[part])) / MEDIAN) ** 2 for part in parts])
     weights = 1.0 / np.maximum(variance, 0.01 * overall)  # errors of variances are relative

@@ -19,6 +19,8 @@ from .files import as_errors
 
 CGROUP = Path("/sys/fs/cgroup")
 OWN_GROUPS = Path("/proc/self/cgroup")
+RENDERINGS_KEPT_MAX = 1 << 30  # [B] that `compare` keeps of renderings that it needs twice
+RENDERINGS_OF_PIXEL = 40.0  # [B] ten float32: four quads, a phasor, distances, opacity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +72,9 @@ def to_reconstruct_on_gpu(frames: int, pixels: int, gaussians: int) -> Need:
 
 def to_compare(frames: int, pixels: int) -> Need:
     """Images of F scored raw frames with their errors, renderings that are kept, and a page."""
-    return Need(memory=190.0 * frames * pixels, disk=2e6)
+    kept = RENDERINGS_OF_PIXEL * frames * pixels
+    kept = kept if kept <= RENDERINGS_KEPT_MAX else 0.0
+    return Need(memory=150.0 * frames * pixels + kept, disk=2e6)
 
 
 def to_render(images: int, pixels: int, channels: int, *, arrays: bool, held: int) -> Need:

@@ -19,7 +19,7 @@ from ..constants import SPEED_OF_LIGHT
 from .cycles import phase_noise
 from .decode import closed_form_distance, quartet_phasors
 from .kept import kept
-from .noise import QuadNoise, amplitudes_of, median_amplitudes, median_of, quad_noise
+from .noise import QuadNoise, amplitudes_of, median_amplitudes, quad_noise
 from .sequence import ColourCamera, Flow, Sequence
 
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
@@ -63,7 +63,7 @@ def agreement(sequence: Sequence) -> Bool[np.ndarray, "Q H W"]:
     if noise is not None and camera_rests(sequence):
         stacked = stacked_quads(sequence)
         reach = AGREES * noise.sigma(median_amplitudes(sequence))
-        agrees = (np.abs(stacked - median_of(stacked)) <= reach).all(axis=1)
+        agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
         agrees &= agrees.sum(axis=0) >= AGREEING_MIN
     agrees.flags.writeable = False
     return agrees

@@ -119,7 +119,7 @@ def score(
     scored = measure.scored_frames(sequence, frames)
     need = resources.to_compare(len(scored), sequence.height * sequence.width)
     resources.require(need, run.path, "score fewer raw frames, --frames ftorf13")
-    rendered = RawFrames(run, sequence, views.RENDERED, kept=True)
+    rendered = RawFrames(run, sequence, views.RENDERED, kept=scored)
     judging, scoring = _in_turn(progress, len(scored))
     explained = residuals.explained(run, rendered, judging)  # first: the fallback needs it
     gathered = views.gather(run, sequence, scored, rendered=rendered, progress=scoring)

@@ -199,7 +199,7 @@ def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*imag
     Raises:
         DivergedError: If it is not finite.
     """
-    array = image.detach().cpu().numpy().astype(np.float32, copy=False)
+    array = image.detach().cpu().numpy().astype(np.float32)
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).sum())
         why = f"{bad} of {array.size} rendered values are NaN or infinite"

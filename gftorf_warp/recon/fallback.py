@@ -78,8 +78,6 @@ class Fallback:
     """Where the temporal mean may be one of two surfaces."""
     explained: Bool[Tensor, "Q H W"]
     """Where the fit explains the quads."""
-    camera_moves: bool
-    """Whether it does, so that there is no temporal mean."""
 
     @classmethod
     def of(
@@ -113,7 +111,7 @@ class Fallback:
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
-        if rests := temporal.camera_rests(sequence):
+        if temporal.camera_rests(sequence):
             needed = np.where(_supported(alone), odds, odds**2)
             needed = np.where(_is_useless(residuals, sequence, noise), 0.0, needed)
             moved = ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
@@ -136,8 +134,12 @@ class Fallback:
             moved=tensor(moved),
             mixed=tensor(near_steps(mean) | np.stack([_at_outlines(image) for image in mean])),
             explained=tensor(explained),
-            camera_moves=not rests,
         )
+
+    @property
+    def camera_moves(self) -> bool:
+        """Whether it does, so that there is no temporal mean."""
+        return not temporal.camera_rests(self.sequence)
 
     def applied(self, rendering: Rendering, time: float, camera: Camera) -> Rendering:
         """A rendering with its distance replaced where the measurement knows better.

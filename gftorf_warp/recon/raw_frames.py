@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
 
+from ..data.resources import RENDERINGS_KEPT_MAX, RENDERINGS_OF_PIXEL
 from ..data.sequence import Sequence
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor
-
-PLANES = 10  # [images] of all that `compare` needs of a rendering
-KEPT_BYTES_MAX = 1 << 30  # [bytes] of renderings
 
 
 class Fitted(Protocol):
@@ -42,7 +40,12 @@ class RawFrames:
     """Renderings of a run before fallback and outlines, each raw frame at its own time and pose."""
 
     def __init__(
-        self, run: Fitted, sequence: Sequence, images: Iterable[str], *, kept: bool = False
+        self,
+        run: Fitted,
+        sequence: Sequence,
+        images: Iterable[str],
+        *,
+        kept: Collection[int] = (),
     ):
         """Prepare a renderer for each frequency.
 
@@ -50,8 +53,8 @@ class RawFrames:
             run: What was fitted.
             sequence: Whose raw frames, at any size.
             images: Names as in :meth:`gftorf_warp.Run.renderer`.
-            kept: Whether a second call for the same raw frame returns the same images, if those of
-                all raw frames fit into a gigabyte; otherwise every call overwrites the last ones.
+            kept: Raw frames that are wanted twice: their images stay, if all of them fit into
+                ``RENDERINGS_KEPT_MAX``; every call overwrites those of others.
         """
         self.sequence = sequence
         """Whose raw frames."""
@@ -61,11 +64,9 @@ class RawFrames:
         self._render = {
             f: run.renderer(names, f_mod_hz=f, corrected=False) for f in sequence.frequencies
         }
-        count = sequence.frames * len(sequence.frequencies)
-        size = 4 * PLANES * count * sequence.width * sequence.height
-        self._kept: dict[tuple[int, float], Rendering] | None = None
-        if kept and size <= KEPT_BYTES_MAX:
-            self._kept = {}
+        size = RENDERINGS_OF_PIXEL * len(kept) * sequence.width * sequence.height
+        self._stays = frozenset(kept) if size <= RENDERINGS_KEPT_MAX else frozenset()
+        self._kept: dict[tuple[int, float], Rendering] = {}
 
     def camera_at(self, n: int) -> Camera:
         """The camera of raw frame n."""
@@ -73,13 +74,13 @@ class RawFrames:
 
     def __call__(self, n: int, f_mod_hz: float) -> Rendering:
         """Raw frame n at one of the frequencies of the sequence [Hz]."""
-        known = self._kept
-        if known is not None and (n, f_mod_hz) in known:
-            return known[n, f_mod_hz]
+        if (n, f_mod_hz) in self._kept:
+            return self._kept[n, f_mod_hz]
         rendering = self._render[f_mod_hz](float(self.sequence.times[n]), self.camera_at(n))
-        if known is not None:
+        # residuals need a raw frame at its own frequency only
+        if n in self._stays and f_mod_hz == self.sequence.frame_frequencies[n]:
             images = {name: _copied(image) for name, image in vars(rendering).items()}
-            known[n, f_mod_hz] = rendering = replace(rendering, **images)
+            self._kept[n, f_mod_hz] = rendering = replace(rendering, **images)
         return rendering
 
 

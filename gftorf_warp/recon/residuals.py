@@ -21,16 +21,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..constants import SPEED_OF_LIGHT
+from ..data import temporal
 from ..data.constant import constant_of
-from ..data.decode import quartet_phasors
-from ..data.noise import amplitudes_of
+from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
+from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
+from ..errors import InputError
 from ..render.api import Rendering
 from ..scene.sensor import Sensor, channel_of, quad_from_phasor
-from .compared import Compared
-from .observations import input_of
+from .observations import as_compared, input_of, reduced
 from .raw_frames import Fitted, RawFrames
-from .settings import Input
+from .settings import Input, Method
 
 LOG = logging.getLogger("gftorf_warp")
 CHI_SQUARE_MAX = 6.0  # noise alone exceeds it in 1e-4 of the pixels, with four raw frames
@@ -42,6 +44,8 @@ FAILED_MIN = 0.05  # of all, of a fit that failed (0.08 to 0.17 injected; good o
 CHANGING_MAX = 0.5  # of those that change, unexplained (0.1; 0.7)
 CONTRADICTED_MAX = 0.05  # of those that do not, at another distance (0.004; 0.13)
 CHANGING_MIN = 1e-3  # of all: noise alone makes 2e-4 of the pixels change
+CONTRADICTION = 0.025  # [unambiguous ranges of the first frequency] 19 cm at 20 MHz
+SIGMAS = 3.0  # [standard deviations of the temporal mean] that are no contradiction
 CENTRAL = (0.05, 0.95)  # quantiles of the unexplained pixels that a message names
 
 
@@ -139,13 +143,23 @@ def residuals(
         progress: Called with (raw frames done, raw frames in all).
 
     Returns:
-        None where there is nothing to compare, see :meth:`Compared.of`.
+        None where nothing was fitted to quads (closed forms, colour alone), or no quartet is
+        complete.
     """
-    compared = Compared.of(sequence, run.config)
-    if compared is None:
+    settings = run.config.get("settings", {})
+    fitted = Method(settings.get("method", Method.GAUSSIANS)).fits
+    if not fitted or not settings.get("weights", {}).get("quads", 1.0) > 0:
         return None
-    measured, noise = compared.sequence, compared.noise
-    phasors = input_of(measured, Input(run.config.get("input", Input.QUADS))) == Input.PHASOR
+    width = run.config.get("size_optimised", (sequence.width, sequence.height))[0]
+    wanted = Input(run.config.get("input", Input.QUADS))
+    measured = as_compared(reduced(sequence, width), wanted)
+    phasors = input_of(measured, wanted) == Input.PHASOR
+    try:
+        noise = quad_noise(measured)
+    except InputError:  # shifts that determine no phase can be fitted, but not decoded
+        return None
+    if noise is None:
+        return None
     if rendered is None or rendered.sequence.quads.shape != measured.quads.shape:
         rendered = RawFrames(run, measured, ("quads", "phasor", "distance"))
     chi_square, scaled, distance = [], [], []
@@ -163,15 +177,16 @@ def residuals(
         if progress is not None:
             count = sequence.cycle * len(measured.complete_quartets)
             progress(sequence.cycle * len(scaled), count)
+    changes, contradicted = _contradictions(measured, noise, np.stack(distance))
     return Residuals(
         quartets=measured.complete_quartets,
-        changes=compared.changes,
-        contradicted=compared.contradicted(np.stack(distance)),
+        changes=changes,
+        contradicted=contradicted,
         chi_square=np.stack(chi_square).astype(np.float32),
         noisy=bool((noise.floor + noise.gain > 0).all()),
         # not finite counts as unexplained
         unexplained=~(np.stack(scaled) <= CHI_SQUARE_MAX),
-        scale=sequence.width / measured.width,
+        scale=sequence.width / width,
         cycle=sequence.cycle,
     )
 
@@ -219,6 +234,21 @@ def _without_constant(
         slots = np.array(frames) - first
         result[slots] -= constant_of(apart[slots], measured.shifts[frames])
     return result
+
+
+def _contradictions(
+    measured: Sequence, noise: QuadNoise, distance: Float[np.ndarray, "Q H W"]
+) -> tuple[Bool[np.ndarray, "Q H W"] | None, Bool[np.ndarray, "Q H W"]]:
+    """``changes`` and ``contradicted`` of the rendered distances [m] of all complete quartets."""
+    if not temporal.camera_rests(measured):
+        return None, np.zeros(distance.shape, dtype=bool)
+    agrees, averaged = temporal.agreement(measured), temporal.averaged(measured)
+    mean = np.stack([closed_form_distance(averaged, i) for i in measured.complete_quartets])
+    reach = unambiguous_range(measured)
+    apart = np.abs((distance - mean + 0.5 * reach) % reach - 0.5 * reach)
+    far = CONTRADICTION * SPEED_OF_LIGHT / (2.0 * measured.frequencies[0])
+    sigma = temporal.sigma_of_mean(measured, noise, agrees.sum(axis=0))
+    return ~agrees, agrees & ~(apart <= np.maximum(far, SIGMAS * sigma))
 
 
 def warn(judged: Residuals | None) -> None:
