@@ -26,6 +26,7 @@ from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.runs.volume import VolumeRun
 from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.recon.volume import fit
 from gftorf_warp.recon.volume.choice import Inputs
 from gftorf_warp.recon.volume.loop import VolumeLoop
 from gftorf_warp.recon.volume.models import VOLUMES, new_volume
@@ -35,6 +36,7 @@ from gftorf_warp.recon.volume.settings import NetworkSettings
 from gftorf_warp.recon.volume.state import begin, from_dict
 from gftorf_warp.recon.volume.step import VolumeStep
 from gftorf_warp.recon.volume.targets import Draw, Targets
+from gftorf_warp.recon.volume.volume import NOTED
 from gftorf_warp.scene.motion import Products
 from gftorf_warp.view.controls import about
 from gftorf_warp.view.subject import Subject
@@ -300,12 +302,12 @@ def test_raw_frames_agree_with_the_true_flow_only(speed, low, high):
     targets.quads = (pattern(x - SPEED * n / 4) / distance**2 * torch.cos(phase)).float()
     volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), pattern, speed)
     terms = terms_of(volume, targets, 30, settings, Draw(0, torch.device("cpu")))
-    assert terms.keys() == {"quads", "size", "kinetic", "round_trip", "flow", "quad_mse"}
+    assert terms.keys() == {"quads", "size", "kinetic", "round_trip", "flow", *NOTED}
     assert low <= terms["quad_mse"] < high
     assert terms["kinetic"] == terms["round_trip"] == 0.0
     assert terms["size"].item() == pytest.approx(1e-3 * speed / 3.0, rel=1e-5)
     first = terms_of(volume, targets, 1, settings, Draw(0, torch.device("cpu")))
-    assert first.keys() == {"quads", "quad_mse"}, "the first steps know no flow"
+    assert first.keys() == {"quads", *NOTED}, "the first steps know no flow"
 
 
 def test_optical_flow_pulls_on_the_scene_flow():
@@ -365,6 +367,42 @@ def test_a_volume_that_diverged_is_not_stored(tmp_path):
     stored = checkpoint.last(tmp_path)
     assert stored["images"] == 0
     assert all(bool(value.isfinite().all()) for value in stored["volume"]["weights"].values())
+
+
+def emptied(monkeypatch, starts):
+    """Makes the first so many starts volumes whose densities are all far below zero."""
+    made = []
+
+    def begun(*args):
+        state = begin(*args)
+        made.append(args[2])
+        if len(made) <= starts:
+            with torch.no_grad():
+                state.volume.moving.density_head.bias.fill_(-1e3)
+        return state
+
+    monkeypatch.setattr(fit, "begin", begun)
+    return made
+
+
+def test_an_empty_volume_begins_again_with_another_seed(monkeypatch, tmp_path, caplog):
+    """Where no ray meets anything nothing has a gradient, so more steps would be in vain."""
+    seeds = emptied(monkeypatch, starts=2)
+    run = reconstruct(small(), tmp_path / "run", toy("ftorf", images=60))
+    assert len(seeds) == len({*seeds}) == 3
+    assert caplog.text.count("no ray meets anything") == 2
+    assert run.config["restarts"] == 2
+    rows = Metrics(tmp_path / "run" / "metrics.jsonl").rows()
+    assert [row["images"] for row in rows] == [10, 20, 30, 40, 50, 60]
+    assert all(row["opacity"] > 0 for row in rows)
+
+
+def test_a_volume_that_stays_empty_is_an_error(monkeypatch, tmp_path):
+    """It is not a result: the first start and every other one were empty."""
+    seeds = emptied(monkeypatch, starts=99)
+    with pytest.raises(DivergedError, match="the volume is empty"):
+        reconstruct(small(), tmp_path / "run", toy("ftorf", images=60))
+    assert len(seeds) == 1 + presets.PRESETS["ftorf"]().restarts_max
 
 
 def unfit(kind):
@@ -428,7 +466,7 @@ def test_contradictions_are_refused(tmp_path, name):
         ({"changes": ["fallback=True"]}, "fallback"),
         ({"changes": ["outlines=True"]}, "outlines"),
         ({"changes": ["attempts_max=2"]}, "attempts_max"),
-        ({"changes": ["restarts_max=0"]}, "restarts_max"),
+        ({"settings": "ctof", "changes": ["restarts_max=0"]}, "restarts_max"),
         ({"changes": ["failures_max=2"]}, "failures_max"),
         ({"changes": ["rollbacks_max=2"]}, "rollbacks_max"),
         ({"settings": "ftorf", "changes": ["weights.colour=1"]}, "weights.colour"),

@@ -327,7 +327,8 @@ class ReconSettings:
     """Fits of a run, 1 or 2: one that its residuals call failed is followed by another one from
     another start, and the better one stays, see recon/attempts.py."""
     restarts_max: int = 3
-    """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
+    """Restarts of collapsed random starts and of empty volumes, and reinitialisations of a dead
+    network, at most."""
 
     def __post_init__(self):
         require(self, "scale_max", "quad_scale", "motion_gradient_max", above=0)
@@ -340,10 +341,12 @@ class ReconSettings:
             )
 
 
-UNREAD = ("attempts_max", "restarts_max", "failures_max", "rollbacks_max")
+UNREAD = ("attempts_max", "failures_max", "rollbacks_max")
 GAUSSIANS_ONLY = ("fallback", "outlines", *UNREAD)
 """Settings that no other method can change; there are runs that state those of ``UNREAD``, which no
 other method ever read."""
+RESTARTED_ONLY = ("restarts_max",)
+"""Settings that Gaussians and volumes have."""
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

@@ -29,7 +29,7 @@ from .loop import Progress, TrainingLoop
 from .observations import former_hash, input_of, observe
 from .record import Metrics, log_to
 from .run import Run
-from .settings import GAUSSIANS_ONLY, FlowSource, Input, Method, ReconSettings
+from .settings import GAUSSIANS_ONLY, RESTARTED_ONLY, FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict
 from .suitable import check_sequence, faithfulness, log_faithfulness
 from .volume import fit
@@ -155,9 +155,13 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why="it needs the flow of every raw frame, which no file contains",
             fix="use --flow dis or --flow deepflow",
         )
-    unfit = [n for n in GAUSSIANS_ONLY if getattr(settings, n) != getattr(ReconSettings, n)]
-    if unfit and settings.method != Method.GAUSSIANS:
-        what, why = f"{unfit[0]} does not fit preset {settings.preset}", "only Gaussians have it"
+    names = () if settings.method == Method.GAUSSIANS else GAUSSIANS_ONLY
+    if not settings.method.fits:
+        names += RESTARTED_ONLY
+    unfit = [n for n in names if getattr(settings, n) != getattr(ReconSettings, n)]
+    if unfit:
+        who = "Gaussians and volumes" if unfit[0] in RESTARTED_ONLY else "Gaussians"
+        what, why = f"{unfit[0]} does not fit preset {settings.preset}", f"only {who} have it"
         raise UsageError(what, where="--set", why=why, fix=f"leave {unfit[0]} out")
     wanted = None
     if settings.method.is_volume:

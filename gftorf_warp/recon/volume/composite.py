@@ -110,12 +110,17 @@ def expected(
     return (weight.reshape(*weight.shape, *[1] * (value.ndim - 2)) * value).sum(dim=1)
 
 
+def opacity(samples: Samples, transmittance: Float[Tensor, "*b R S"]) -> Float[Tensor, "*b R"]:
+    """Share of the light that is stopped [1]."""
+    return (samples.alpha * transmittance).sum(dim=-1)
+
+
 def distortion(samples: Samples, transmittance: Float[Tensor, "*b R S"]) -> Float[Tensor, "*b R"]:
     """Sum over pairs of samples k, l of w_k w_l (d_k - d_l)^2, w = alpha T [m^2]."""
     weight = samples.alpha * transmittance
-    opacity = weight.sum(dim=-1)
+    total = weight.sum(dim=-1)
     mean, square = ((weight * samples.distance**power).sum(dim=-1) for power in (1, 2))
-    return (2.0 * (opacity * square - mean.square())).clamp_min(0.0)
+    return (2.0 * (total * square - mean.square())).clamp_min(0.0)
 
 
 def median_distance(samples: Samples, transmittance: Float[Tensor, "R S"]) -> Float[Tensor, "R"]:

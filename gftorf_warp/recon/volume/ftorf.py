@@ -115,7 +115,7 @@ class Ftorf(Volume):
                 samples = self.samples(trunk, rays, depths, draw=draw)
             mse = _errors(targets, given, samples, pixels).mean()
             more = self.more_terms(rays, depths, samples, settings)
-            return {"quads": weight * mse, "quad_mse": mse.detach()} | more
+            return {"quads": weight * mse} | self.noted(mse, samples) | more
         with self.precision():
             # the flows of its neighbours are of the same products
             rows = points.expand(len(given["own"]), *points.shape)
@@ -127,7 +127,7 @@ class Ftorf(Volume):
         terms = {
             "quads": weight * (errors[0] + given["larger"][0] * errors[1:].sum()),
             **regularisers(flows, gap, self.settings.scene_flow),
-            "quad_mse": errors.mean().detach(),
+            **self.noted(errors.mean(), samples),
         }
         if key.optical:
             measured = picked(targets.flow, given["flow_row"], pixels)

@@ -20,6 +20,12 @@ from .step import VolumeStep
 LOG = logging.getLogger("gftorf_warp")
 
 
+class EmptyVolumeError(Exception):
+    """No ray met anything since the last row of metrics, noise on the densities included: nothing
+    has a gradient any more.
+    """
+
+
 class VolumeLoop:
     """Trains a volume until its steps are used up."""
 
@@ -57,6 +63,7 @@ class VolumeLoop:
 
         Raises:
             DivergedError: If the loss is not finite; the last checkpoint is kept.
+            EmptyVolumeError: If nothing can be learnt any more.
             KeyboardInterrupt: After a signal, when everything is stored.
         """
         state, schedule = self.state, self.settings.schedule
@@ -111,6 +118,7 @@ class VolumeLoop:
 
         Raises:
             DivergedError: If the loss is not finite.
+            EmptyVolumeError: If nothing can be learnt any more.
         """
         state = self.state
         sums = [state.sums[name] for name in state.counts]
@@ -121,6 +129,8 @@ class VolumeLoop:
         state.counts.clear()
         if not math.isfinite(means["loss"]):
             raise self._diverged("the loss is not finite")
+        if means.get("opacity") == 0.0:
+            raise EmptyVolumeError
         mse = means.pop("quad_mse", 0.0)
         psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
         row = {"images": state.images, "seconds": self.clock(), **means, "quad_psnr_db": psnr}

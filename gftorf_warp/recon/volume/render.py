@@ -63,12 +63,11 @@ def rendering_of(
 def _images(samples: Samples, sensor: Sensor, *, colour: bool) -> dict[str, Float[Tensor, "*c R"]]:
     """Every image of some rays, by the names of ``Rendering``."""
     transmittance = samples.transmittance
-    ones = torch.ones_like(samples.alpha)
     images = {
         "quads": composite.quads(samples, sensor, transmittance),
         "phasor": composite.phasor(samples, sensor, transmittance),
         "distance": composite.expected(samples, transmittance, samples.distance),
-        "opacity": composite.expected(samples, transmittance, ones),
+        "opacity": composite.opacity(samples, transmittance),
         "distortion": composite.distortion(samples, transmittance),
         "distance_median": composite.median_distance(samples, transmittance),
     }

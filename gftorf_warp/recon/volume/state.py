@@ -23,6 +23,8 @@ class VolumeState:
     def __init__(self, volume: Volume, settings: VolumeSettings, seed: int):
         """Begin at step 0."""
         self.volume, self.images, self.seconds = volume, 0, 0.0
+        self.restarts = 0
+        """How often the run began again, with another seed."""
         self.optimiser = torch.optim.Adam(
             volume.parameters(), lr=settings.rate, eps=settings.epsilon, fused=True
         )
@@ -40,6 +42,7 @@ class VolumeState:
             "format": FORMAT,
             "images": self.images,
             "seconds": self.seconds,
+            "restarts": self.restarts,
             "volume": self.volume.to_dict(),
             "adam": self.optimiser.state_dict(),
             "scaler": self.scaler.state_dict(),
@@ -73,6 +76,7 @@ def from_dict(
     state.scaler.load_state_dict(stored["scaler"])
     state.draw.restore(stored["draw"])
     state.images, state.seconds = stored["images"], stored["seconds"]
+    state.restarts = stored.get("restarts", 0)  # those of before had none
     state.counts = dict(stored["counts"])
     state.sums = {name: value.to(volume.device) for name, value in stored["sums"].items()}
     return state

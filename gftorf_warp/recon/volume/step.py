@@ -19,6 +19,7 @@ from ..settings import ReconSettings
 from .choice import Given, Inputs
 from .state import VolumeState
 from .targets import Targets
+from .volume import NOTED
 
 Replayed = Callable[[Callable[[], object]], object]
 """Runs a function, the same in all calls, or replays what it did."""
@@ -87,11 +88,11 @@ class VolumeStep:
         # the outer context keeps weights in half precision for all products of the step
         with volume.precision(), torch.autocast(volume.device.type, enabled=False):
             terms = volume.terms(self.targets, key, given, self.settings, state.draw)
-        mse = terms.pop("quad_mse", None)
+        noted = {name: terms.pop(name) for name in NOTED if name in terms}
         loss = torch.stack([*terms.values()]).sum()
         scaled = state.scaler.scale(loss / self._accumulated)
         gradients = torch.autograd.grad(scaled, self._parameters, allow_unused=True)
-        noted = {"loss": loss, **terms} | ({} if mse is None else {"quad_mse": mse})
+        noted |= {"loss": loss, **terms}
         with torch.no_grad():
             self._add_to_parameters(gradients)
             for name in noted:

@@ -71,17 +71,18 @@ class Torf(Volume):
         """The error of a phasor or of a colour image."""
         if key == "colour":
             return {"colour": settings.weights.colour * self._colour(targets, given, draw)}
-        mse = self._phasor(targets, given, draw)
-        return {"quads": given["weight"][0] * mse, "quad_mse": mse.detach()}
+        mse, samples = self._phasor(targets, given, draw)
+        return {"quads": given["weight"][0] * mse} | self.noted(mse, samples)
 
-    def _phasor(self, targets: Targets, given: Given, draw: Draw) -> Tensor:
-        """Mean squared error of (re, im) [optimised units^2]."""
+    def _phasor(self, targets: Targets, given: Given, draw: Draw) -> tuple[Tensor, Samples]:
+        """Mean squared error of (re, im) [optimised units^2], and the samples that have it."""
         pixels = draw.pixels(self.settings.rays, targets.views.pixels)
         rays = targets.views.rays(given["view"], pixels)
         samples = self._drawn(rays, given["quartet"], draw)
         sensor, passed = targets.observations.sensor, samples.transmittance
         rendered = composite.phasor(samples, sensor, passed, given["slope"])[:2]
-        return torch.mean((rendered - picked(targets.phasors, given["row"], pixels)).square())
+        apart = rendered - picked(targets.phasors, given["row"], pixels)
+        return torch.mean(apart.square()), samples
 
     def _colour(self, targets: Targets, given: Given, draw: Draw) -> Tensor:
         """Mean squared error of the colour [1]."""

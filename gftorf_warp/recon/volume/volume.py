@@ -21,6 +21,8 @@ from .rays import Depths, Rays, evenly
 from .settings import VolumeSettings
 from .targets import Draw, Targets
 
+NOTED = ("quad_mse", "opacity")
+"""What a step notes besides the terms of its loss: the unweighted error, and the mean opacity."""
 SCALED = (2.0, 2.0, 1.0)  # [1] x, y and z over the depth of the box, as published
 
 
@@ -114,7 +116,7 @@ class Volume(torch.nn.Module, abc.ABC):
     def terms(
         self, targets: Targets, key: Any, given: Given, settings: ReconSettings, draw: Draw
     ) -> dict[str, Tensor]:
-        """Weighted terms of the loss of one step, and ``quad_mse``, the unweighted one.
+        """Weighted terms of the loss of one step; of light that was compared, what ``NOTED`` names.
 
         Captured as a CUDA graph: the key decides about operations, whatever else differs between
         steps is on the device.
@@ -200,6 +202,11 @@ class Volume(torch.nn.Module, abc.ABC):
             strength=strength,
             colour=alpha[..., None] * light.colour if colour else None,
         )
+
+    def noted(self, mse: Tensor, samples: Samples) -> dict[str, Tensor]:
+        """What ``NOTED`` names, without gradients."""
+        opacity = composite.opacity(samples, samples.transmittance).mean()
+        return dict(zip(NOTED, (mse.detach(), opacity.detach()), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values and tensors, for a checkpoint."""
