@@ -155,7 +155,7 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why="it needs the flow of every raw frame, which no file contains",
             fix="use --flow dis or --flow deepflow",
         )
-    names = () if settings.method == Method.GAUSSIANS else GAUSSIANS_ONLY
+    names: tuple[str, ...] = () if settings.method == Method.GAUSSIANS else GAUSSIANS_ONLY
     if not settings.method.fits:
         names += RESTARTED_ONLY
     unfit = [n for n in names if getattr(settings, n) != getattr(ReconSettings, n)]
