@@ -8,8 +8,8 @@ the sequence's path under OUT. A SEQUENCE named random-N that does not exist is 
 engine mesh at 96x72, 24 raw frames. `score` prints the error of d over that of the closed form on
 the same pixels, geometric means over the sequences of one parent folder, on every fifth raw frame,
 for all, moving and static pixels and for the static ones beside steps and elsewhere: of the
-fallback alone, with outlines, and with constants of recon/outlines.py, recon/phasors.py or
-recon/straight.py changed (several in one SPEC by commas).
+fallback alone, with outlines, and with constants of recon/outlines.py, recon/passing.py,
+recon/phasors.py or recon/straight.py changed (several in one SPEC by commas).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gftorf_warp.data.steps import near_steps
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
-from gftorf_warp.recon import outlines, phasors, straight
+from gftorf_warp.recon import outlines, passing, phasors, straight
 from gftorf_warp.recon.raw_frames import RawFrames
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
@@ -38,7 +38,7 @@ from gftorf_warp.sim.random_scene import random_scene
 
 SIZE, FRAMES = (96, 72), 24  # of simulated scenes
 FIRST, EVERY = 2, 5  # [raw frames] scored ones: their slots differ
-MODULES = {"outlines": outlines, "phasors": phasors, "straight": straight}
+MODULES = {"outlines": outlines, "passing": passing, "phasors": phasors, "straight": straight}
 Stored = dict[str, Any]
 
 
@@ -100,7 +100,7 @@ def rule(stored: Stored, spec: str) -> Callable[[int, Rendering], torch.Tensor]:
     """A function of raw frame and rendering: its distances after outlines, with changed
     constants.
     """
-    run, measured = stored["open"], stored["measured"]
+    run, measured, moving = stored["open"], stored["measured"], stored["moving"]
     frequency = float(run.sensor.f_mod_hz)
     for change in filter(None, spec.split(",")):
         name, _, value = change.partition("=")
@@ -113,7 +113,8 @@ def rule(stored: Stored, spec: str) -> Callable[[int, Rendering], torch.Tensor]:
         time = float(run.sequence().times[n])
         camera = camera_at(run, run.sequence(), time)
         phasor = measured and measured.corrected(rendering, time, camera, frequency)
-        return outlines.resolved(rendering, run.sensor, phasor).distance
+        others = moving and moving.at(rendering, time, camera, frequency)
+        return outlines.resolved(rendering, run.sensor, phasor, passing=others).distance
 
     return resolved
 
@@ -124,7 +125,7 @@ def score(out: Path, specs: list[str]) -> None:
     for path in sorted(out.glob("*.pt")):
         stored = torch.load(path, weights_only=False)  # a file of our own
         run = stored["open"] = Run.open(stored["run"], "cpu")
-        stored["measured"] = run._measured_phasors
+        stored["measured"], stored["moving"] = run._measured_phasors, run._moving_outlines
         stored["sequence"] = run.config["sequence"]
         groups.setdefault(path.stem.partition("-")[0], []).append(stored)
     constants = {

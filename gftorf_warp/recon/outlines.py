@@ -15,7 +15,7 @@ its position does, see straight.py. So every share has a likelihood, and the dis
 both surfaces' distances, weighted by the odds that the centre is on them. Pairs of neighbours in
 four directions vote with their likelihoods, against a surface of the pixel's own, of which any
 phasor is as likely: its distance is the rendered one. The phasor is not only rendered, see
-phasors.py.
+phasors.py, and of a moving outline other raw frames tell more, see passing.py.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from torch import Tensor
 
 from ..data.steps import STEP_M
 from ..render.api import Rendering
+from ..scene.measured import extremes
 from ..scene.sensor import Sensor
+from .passing import Passing, evidence
 from .phasors import CLOSED_FORM, Phasor, rendered_phasor
 from .straight import Outline, along_outline
 
@@ -45,7 +47,8 @@ GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
 FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
 BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
 EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
-HALF = 0.5  # [1] of the change of a closed form that is kept
+HALF = 0.5  # [1] of the change of a closed form that is kept where the camera moves
+QUARTER = 0.25  # [1] of the fit in the distance there
 ANY = 1.0 / math.pi  # density of any phasor in a unit disc
 LEAST = 1e-12  # [quad units] below it a neighbour is black
 MARGIN = 3  # [pixels] to the farthest neighbour
@@ -56,7 +59,8 @@ def resolved(
     sensor: Sensor,
     phasor: Phasor | None = None,
     *,
-    camera_moves: bool = False,
+    fitted: Float[Tensor, "H W"] | None = None,
+    passing: Passing | None = None,
 ) -> Rendering:
     """A rendering with the distances of its mixed pixels resolved.
 
@@ -64,9 +68,11 @@ def resolved(
         rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
         phasor: The phasor as well as it is known; None: as it is rendered.
-        camera_moves: Whether the closed form of a fallback is resolved too, by half: what
-            ``phasor`` decodes to has less noise than the closed form, and where the odds are wrong,
-            a distance between two surfaces costs less than the wrong one of them.
+        fitted: Distance before a fallback, where the camera moves. Then the closed form is resolved
+            too, by half, since where the odds are wrong a distance between two surfaces costs less
+            than the wrong one of them; and a quarter of the result is the fit's, which has other
+            errors, as far as it is within the distances around a pixel. None: closed forms stay.
+        passing: What other raw frames tell of moving outlines; None: nothing.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
@@ -76,15 +82,20 @@ def resolved(
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
     lit = rendering.phasor[2] > 0.0
     where = (source == 0) & lit  # the others are measured, or black
-    closed_form = (source == CLOSED_FORM) & lit & camera_moves
-    if camera_moves:
+    closed_form = (source == CLOSED_FORM) & lit
+    if fitted is not None:  # what the phasor decodes to has less noise than the closed form
         fit = torch.where(closed_form, phasor.decoded(fit, sensor), fit)
         where |= closed_form
     distance = fit
     for _ in range(PASSES):
-        distance = _resolved(distance, phasor, where, sensor)
-    distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
+        distance = _resolved(distance, phasor, where, sensor, passing)
+    if fitted is not None:
+        distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
     changed = (distance - fit).abs() > 0.01 * STEP_M
+    if fitted is not None:
+        low, high = extremes(distance)
+        within = torch.minimum(torch.maximum(fitted, low), high)
+        distance = torch.where(closed_form, torch.lerp(distance, within, QUARTER), distance)
     return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
 
 
@@ -108,7 +119,11 @@ class _Side(NamedTuple):
 
 
 def _resolved(
-    distance: Float[Tensor, "H W"], phasor: Phasor, where: Bool[Tensor, "H W"], sensor: Sensor
+    distance: Float[Tensor, "H W"],
+    phasor: Phasor,
+    where: Bool[Tensor, "H W"],
+    sensor: Sensor,
+    passing: Passing | None,
 ) -> Float[Tensor, "H W"]:
     """One pass over the pixels ``where`` a distance may change."""
     amplitude = phasor.value.abs().clamp_min(LEAST)
@@ -117,16 +132,21 @@ def _resolved(
     weighted = total * distance
     beyond, light = _padded(distance), _padded(torch.log(amplitude))
     chances = torch.tensor(GAIN_CHANCES, device=distance.device)
-    on_first = torch.special.ndtr((_shares(distance.device) - 0.5) / BLUR)
+    gains, shares = torch.tensor(GAINS, device=distance.device), _shares(distance.device)
+    on_first = torch.special.ndtr((shares - 0.5) / BLUR)
     for direction in DIRECTIONS:
         before, after = (-direction[0], -direction[1]), direction
         mixed = where & _between_two_surfaces(beyond, before, after)
         pixels = torch.nonzero(mixed, as_tuple=True)
         first, second = _sides(beyond, light, pixels, (before, after))
         unit, of_gains = nearby[pixels], [_with_gain(first, second, gain) for gain in GAINS]
-        alone = [_likelihood(phasor, pixels, unit, sides, sensor) for sides in of_gains]
+        each = [_likelihood(phasor, pixels, unit, sides, sensor) for sides in of_gains]
         outline = Outline(after, pixels, first.distance, second.distance, distance, SMOOTH)
-        likelihood = along_outline(torch.stack(alone) / SHARES, chances, ANY, outline)
+        alone = torch.stack(each) / SHARES
+        if passing is not None:
+            amplitudes = first.amplitude, second.amplitude
+            alone *= evidence(passing, outline, amplitudes, gains, shares, sensor).exp()
+        likelihood = along_outline(alone, chances, ANY, outline)
         odds = (likelihood * on_first[:, None]).sum(dim=0)
         both = likelihood.sum(dim=0)
         mean = odds * first.distance + (both - odds) * second.distance

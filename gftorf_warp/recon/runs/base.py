@@ -28,6 +28,7 @@ from ..residuals import Residuals, residuals
 from ..settings import Method
 from ..state import field_and_motion
 from . import gaussians
+from .moving import MovingOutlines
 from .stored import StoredRun, at_frequency
 
 LOG = logging.getLogger("gftorf_warp")
@@ -143,15 +144,20 @@ class Run(StoredRun):
         """
         if not self._corrects:
             return rendering
+        fitted = None
         if self.fallback is not None:
+            fitted = rendering.distance if self.fallback.camera_moves else None
             rendering = self.fallback.applied(rendering, time, camera)
         sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
         phasor = None
         if measured is not None:
             phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
         if self.config["settings"].get("outlines") and not light_only:
-            moves = self.fallback is not None and self.fallback.camera_moves
-            rendering = outlines.resolved(rendering, sensor, phasor, camera_moves=moves)
+            passing = None
+            if self._moving_outlines is not None:
+                frequency = float(sensor.f_mod_hz)
+                passing = self._moving_outlines.at(rendering, time, camera, frequency)
+            rendering = outlines.resolved(rendering, sensor, phasor, fitted=fitted, passing=passing)
         if phasor is None or self.fallback is None:
             return rendering
         return phasor.within(rendering, sensor)
@@ -221,6 +227,12 @@ class Run(StoredRun):
         except InputError as error:
             LOG.warning("outlines from renderings alone: %s: %s", error.what, error.why)
             return None
+
+    @functools.cached_property
+    def _moving_outlines(self) -> MovingOutlines | None:
+        """What other raw frames tell of them; None where they cannot be followed."""
+        measured = self._measured_phasors
+        return None if measured is None else MovingOutlines.of(self, measured)
 
     def images(
         self,

@@ -1,0 +1,135 @@
+"""What a run of windows knows of outlines that move: its flow, and its static layer alone."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...data.temporal import camera_rests
+from ...render.api import Rendering, rasterize
+from ...scene.camera import Camera
+from ...scene.measured import frame_period
+from ...scene.windows import Windows
+from .. import closed_form
+from ..observations import input_of
+from ..passing import SPAN, Passing, normals_of
+from ..phasors import MeasuredPhasors
+from ..settings import Input
+from .gaussians import widened
+from .stored import StoredRun
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovingOutlines:
+    """Moving outlines of a run of quads at one frequency, from a camera at rest."""
+
+    run: StoredRun
+    """The run; its motion is one of windows."""
+    motion: Windows
+    """Its motion."""
+    measured: MeasuredPhasors
+    """What was measured, of its sequence."""
+
+    @classmethod
+    def of(cls, run: StoredRun, measured: MeasuredPhasors) -> MovingOutlines | None:
+        """Those of a run; None of one that outlines cannot be followed in."""
+        sequence, motion = measured.sequence, run.motion
+        if not isinstance(motion, Windows) or not bool((run.binding[:, 0] > 0.0).any()):
+            return None
+        compared = input_of(sequence, Input(run.config.get("input", Input.QUADS)))
+        if compared != Input.QUADS or sequence.from_phasors or len(sequence.frequencies) > 1:
+            return None
+        if not camera_rests(sequence):
+            return None
+        return cls(run=run, motion=motion, measured=measured)
+
+    @torch.no_grad()
+    def at(
+        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float
+    ) -> Passing | None:
+        """What other raw frames measured of the outlines of a rendering.
+
+        Args:
+            rendering: With its distance.
+            time: Of the rendering [s].
+            camera: Of the rendering.
+            f_mod_hz: Modulation frequency [Hz].
+
+        Returns:
+            None unless the rendering is of a measured raw frame, seen from the sequence's own
+            camera, and another one is near.
+        """
+        sequence = self.measured.sequence
+        n = int(np.abs(sequence.times - time).argmin())
+        at_frame = abs(sequence.times[n] - time) <= closed_form.TIME_S
+        if not at_frame or not sequence.measured[n] or f_mod_hz not in sequence.frequencies:
+            return None
+        if closed_form.another_view(sequence, time, camera, self.measured.camera):
+            return None
+        near = range(max(n - SPAN, 0), min(n + SPAN + 1, sequence.frames))
+        others = [m for m in near if m != n and sequence.measured[m]]
+        if not others:
+            return None
+        (moving, *flow), static = self._flow(time, camera), self._static
+        re, im, _ = static.phasor / self.run.quad_scale
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, device=moving.device, dtype=torch.float32)
+
+        later = (sequence.times[others] - sequence.times[n]) / frame_period(sequence)
+        slots = [m % sequence.cycle for m in others]
+        return Passing(
+            quads=tensor(sequence.quads[others]),
+            variance=self.measured.of_quads[slots],
+            shifts=tensor(sequence.shifts[others]),
+            later=tensor(later),
+            moving=moving,
+            flow=torch.stack(flow),
+            behind=torch.complex(re, im),
+            opacity=static.opacity,
+            normals=normals_of(rendering.distance),
+        )
+
+    def _flow(self, time: float, camera: Camera) -> Float[Tensor, "3 H W"]:
+        """Weight of moving Gaussians [1], and their velocity times it [px per raw frame]."""
+        run = self.run
+        window = self.motion.keys_at(time).index[0] // 2
+        start, end = self.motion.times[window : window + 2]
+        keys = torch.tensor([2 * window, 2 * window + 1], device=run.field.device)
+        rows = self.motion.present(run.binding, keys).nonzero()[:, 0]
+        binding, field = run.binding[rows], run.field.map(lambda values: values[rows])
+        before, after = self.motion.at_keys(binding, keys).offset
+        velocity = (after - before) * frame_period(self.measured.sequence) / (end - start)
+        field = field.moved(*self.motion.at(binding, time))
+        flow = camera.project(field.mean + velocity) - camera.project(field.mean)
+        moves = (binding[:, :1] > 0.0).to(flow)
+        extra = torch.cat([moves, torch.nan_to_num(flow) * moves], dim=1)
+        rendering = rasterize(
+            widened(run, field, camera),
+            camera,
+            run.sensor,
+            run.render_settings,
+            extra=extra,
+            images=("opacity",),
+        )
+        assert rendering.extra is not None
+        return rendering.extra
+
+    @functools.cached_property
+    def _static(self) -> Rendering:
+        """Phasor and opacity of the static layer alone, in the units of the optimisation."""
+        run, camera = self.run, self.measured.camera
+        rows: Int[Tensor, "S"] = (run.binding[:, 0] == 0.0).nonzero()[:, 0]
+        field = replace(run.field.map(lambda values: values[rows]), colour_sh=None)
+        return rasterize(
+            widened(run, field, camera),
+            camera,
+            run.sensor,
+            run.render_settings,
+            images=("phasor", "opacity"),
+        )

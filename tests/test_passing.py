@@ -1,0 +1,308 @@
+"""Moving outlines: what quads of other raw frames tell of the share of a mixed pixel."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from moving_box import as_phasors, flow, recording, seen
+from sequences import changed
+
+from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
+from gftorf_warp.data.write import write
+from gftorf_warp.recon import outlines, presets
+from gftorf_warp.recon.passing import Passing, evidence, normals_of
+from gftorf_warp.recon.phasors import MeasuredPhasors, Phasor
+from gftorf_warp.recon.runs.moving import MovingOutlines
+from gftorf_warp.recon.straight import Outline
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render.api import Rendering
+from gftorf_warp.scene.motion import Still
+from gftorf_warp.scene.sensor import Sensor
+
+HEIGHT, WIDTH, RAYS = 24, 40, 12
+NEAR, FAR = 2.0, 2.9  # [m]
+TILT = 0.23  # [px per row] of the edge
+EDGE = 20.37  # [px] where it is in row 0 at the raw frame
+NOISE = 1e-4  # [quad units]
+GAINS, SHARES = torch.tensor(outlines.GAINS), torch.linspace(0.0, 1.0, outlines.SHARES)
+SENSOR = Sensor(phase_offset=0.4)
+OTHERS = [-3, -2, -1, 1, 2, 3]  # [raw frames] later
+
+
+def subsamples():
+    """Positions (x, y) [px] of RAYS x RAYS rays per pixel."""
+    at = (np.arange(HEIGHT * RAYS) + 0.5) / RAYS, (np.arange(WIDTH * RAYS) + 0.5) / RAYS
+    return np.meshgrid(*at, indexing="ij")[::-1]
+
+
+def mean(image):
+    """Means over the rays of every pixel."""
+    return image.reshape(HEIGHT, RAYS, WIDTH, RAYS).mean(axis=(1, 3))
+
+
+def light(distance, reflectivity):
+    """Phasors of length 2a."""
+    phase = SENSOR.phase_slope * distance + SENSOR.phase_offset
+    return 2.0 * reflectivity / distance**2 * np.exp(1j * phase)
+
+
+class MovingEdge:
+    """A near surface with a slanted edge that moves to the right in front of a textured wall.
+
+    Args:
+        velocity: Of the edge [px per raw frame].
+        left: Whether the near surface is on the left of its edge; or on its right.
+    """
+
+    def __init__(self, velocity, left=True):
+        self.velocity, self.left = velocity, left
+        x, y = subsamples()
+        wall = light(FAR, 0.5 + 0.2 * np.sin(1.1 * x) * np.cos(0.7 * y))
+        self.wall, front = mean(wall), light(NEAR, 0.6)
+        covered = {k: (x < EDGE + TILT * y + velocity * k) == left for k in [0, *OTHERS]}
+        self.share = mean(covered[0])
+        phasors = {k: mean(np.where(there, front, wall)) for k, there in covered.items()}
+        self.phasor = phasors[0]
+        self.shifts = [CANONICAL_SHIFTS[k % 4] for k in OTHERS]
+        quads = [
+            0.5 * (phasors[k] * np.exp(-1j * shift)).real
+            for k, shift in zip(OTHERS, self.shifts, strict=True)
+        ]
+        noise = NOISE * np.random.default_rng(0).standard_normal((len(OTHERS), HEIGHT, WIDTH))
+        self.quads = np.stack(quads) + noise
+        centre = (np.arange(WIDTH) + 0.5 < EDGE + TILT * (np.arange(HEIGHT) + 0.5)[:, None]) == left
+        self.truth = np.where(centre, NEAR, FAR)
+        self.rendered = NEAR * self.share + FAR * (1.0 - self.share)
+
+    def passing(self, moves=1.0):
+        """What is known of it, if the near surface has this weight of moving Gaussians."""
+        moving = moves * tensor(self.share)
+        return Passing(
+            quads=tensor(self.quads),
+            variance=torch.full((len(OTHERS), HEIGHT, WIDTH), NOISE**2),
+            shifts=tensor(self.shifts),
+            later=tensor(OTHERS),
+            moving=moving,
+            flow=torch.stack([self.velocity * moving, 0.0 * moving]),
+            behind=torch.tensor(self.wall, dtype=torch.complex64),
+            opacity=torch.ones(HEIGHT, WIDTH),
+            normals=normals_of(tensor(self.rendered)),
+        )
+
+    def rendering(self, error=0.2, seed=0):
+        """A rendering, and its phasor with an error relative to the amplitude."""
+        random = np.random.default_rng(seed).standard_normal((2, HEIGHT, WIDTH))
+        amplitude = np.abs(self.phasor).max()
+        wrong = self.phasor + error * amplitude * (random[0] + 1j * random[1])
+        none, flat = torch.zeros(0, HEIGHT, WIDTH), torch.zeros(0, WIDTH)
+        rendering = Rendering(
+            quads=none,
+            phasor=tensor([self.phasor.real, self.phasor.imag, abs(self.phasor)]),
+            colour=None,
+            distance=tensor(self.rendered),
+            opacity=flat,
+            distortion=flat,
+            distance_median=flat,
+            extra=None,
+            screen=None,
+        )
+        variance = torch.full((HEIGHT, WIDTH), (error * amplitude) ** 2)
+        # mixed pixels only: what is beside them is known
+        value = np.where((self.share > 0.0) & (self.share < 1.0), wrong, self.phasor)
+        return rendering, Phasor(
+            value=torch.tensor(value, dtype=torch.complex64),
+            variance_re=variance,
+            variance_im=variance,
+            covariance=torch.zeros_like(variance),
+        )
+
+
+def tensor(values):
+    """In single precision."""
+    return torch.as_tensor(np.array(values), dtype=torch.float32)
+
+
+def mixed_pixels(edge):
+    """The mixed pixels of an edge between columns, and amplitudes on both sides."""
+    row, column = np.nonzero((edge.share > 0.02) & (edge.share < 0.98))
+    near, far = (abs(light(*of)) for of in ((NEAR, 0.6), (FAR, 0.5)))
+    order = slice(None) if edge.left else slice(None, None, -1)
+    (first, second), amplitudes = ((NEAR, FAR)[order], (near, far)[order])
+    pixels = torch.tensor(row), torch.tensor(column)
+    distances = [torch.full((len(row),), value) for value in (first, second)]
+    outline = Outline((0, 1), pixels, *distances, tensor(edge.rendered), 0.25)
+    share = edge.share[row, column]
+    amplitudes = tuple(torch.full((len(row),), float(value)) for value in amplitudes)
+    return outline, amplitudes, tensor(share if edge.left else 1.0 - share)
+
+
+def likeliest(likelihood):
+    """Each pixel's most likely share under its logarithm of a likelihood [g s P]."""
+    return SHARES[likelihood.logsumexp(dim=0).argmax(dim=0)]
+
+
+@pytest.mark.parametrize("left", [True, False])
+@pytest.mark.parametrize("velocity", [0.4, -1.3, 2.7])
+def test_other_raw_frames_tell_the_share(velocity, left):
+    """Whatever the velocity, and on whichever side the surface in front is."""
+    edge = MovingEdge(velocity, left)
+    outline, amplitudes, true = mixed_pixels(edge)
+    given = evidence(edge.passing(), outline, amplitudes, GAINS, SHARES, SENSOR)
+    torch.testing.assert_close(given.exp().mean(dim=(0, 1)), torch.ones_like(true))
+    apart = (likeliest(given) - true).abs()
+    assert apart.mean() < 0.1
+
+
+@pytest.mark.parametrize("velocity", [0.4, -1.3, 2.7])
+def test_fewer_mixed_pixels_are_on_the_wrong_side(velocity):
+    """Of a phasor that is wrong by a third of the light."""
+    edge = MovingEdge(velocity)
+    mixed = (edge.share > 0.02) & (edge.share < 0.98) & (abs(edge.share - 0.5) > 0.05)
+    wrong = {"without": 0, "with": 0}
+    for seed in range(10):
+        rendering, phasor = edge.rendering(error=0.3, seed=seed)
+        for name, passing in (("without", None), ("with", edge.passing())):
+            given = outlines.resolved(rendering, SENSOR, phasor, passing=passing)
+            apart = abs(given.distance.numpy() - edge.truth)
+            wrong[name] += (apart > 0.5 * (FAR - NEAR))[mixed].sum()
+    assert wrong["with"] < 0.7 * wrong["without"]
+
+
+def test_where_nothing_moves_nothing_is_told():
+    """Nor of an edge that is too fast, or along the line of pixels: all shares are as likely, and
+    the distances are those without other raw frames.
+    """
+    edge = MovingEdge(0.4)
+    outline, amplitudes, _ = mixed_pixels(edge)
+    rendering, phasor = edge.rendering()
+    alone = outlines.resolved(rendering, SENSOR, phasor).distance
+    passing = edge.passing()
+    along = passing.normals.flip(0) * torch.tensor([0.1, 1.0])[:, None, None]
+    for nothing in (
+        edge.passing(moves=0.2),
+        replace(passing, flow=20.0 * passing.flow),
+        replace(passing, normals=along),
+    ):
+        given = evidence(nothing, outline, amplitudes, GAINS, SHARES, SENSOR)
+        assert given.shape == (len(GAINS), len(SHARES), len(outline.first))
+        assert not given.any()
+    still = outlines.resolved(rendering, SENSOR, phasor, passing=edge.passing(moves=0.2))
+    assert torch.equal(still.distance, alone)
+    assert not torch.equal(
+        outlines.resolved(rendering, SENSOR, phasor, passing=passing).distance, alone
+    )
+
+
+def test_an_outline_that_leaves_the_image_tells_nothing():
+    """All its other positions are outside."""
+    edge = MovingEdge(-1.3)
+    cut = slice(19, 24)  # columns; the outline has left them after few raw frames
+    passing = edge.passing()
+    names = ("quads", "variance", "moving", "flow", "behind", "opacity", "normals")
+    passing = replace(passing, **{name: getattr(passing, name)[..., cut] for name in names})
+    outline, amplitudes, _ = mixed_pixels(edge)
+    near = outline.pixels[1] < 21
+    pixels = outline.pixels[0][near], outline.pixels[1][near] - cut.start
+    first, second = outline.first[near], outline.second[near]
+    inside = outline._replace(pixels=pixels, first=first, second=second)
+    sides = [amplitude[near] for amplitude in amplitudes]
+    far = replace(passing, later=100.0 * passing.later)
+    assert not evidence(far, inside, sides, GAINS, SHARES, SENSOR).any()
+    assert evidence(passing, inside, sides, GAINS, SHARES, SENSOR).isfinite().all()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short fit of a moving box, with windows."""
+    folder = tmp_path_factory.mktemp("runs")
+    write("ftorf", folder / "box", *recording())
+    settings = presets.best()
+    schedule = replace(settings.schedule, images=80)
+    settings = replace(settings, schedule=schedule, attempts_max=1)
+    return reconstruct(folder / "box", folder / "run", settings)
+
+
+def passing_of(run, n, sequence=None, camera=None, time=None):
+    """What is known of the outlines of raw frame n of a run, or of its other sequence."""
+    sequence = sequence or run.sequence()
+    measured = MeasuredPhasors.of(sequence, run.camera, run.field.device)
+    outlines_of_run = MovingOutlines.of(run, measured)
+    if outlines_of_run is None:
+        return None
+    camera = camera or run.camera
+    time = float(sequence.times[n]) if time is None else time
+    rendering = run.renderer(("distance", "phasor"), corrected=False)(time, camera)
+    return outlines_of_run.at(rendering, time, camera, float(run.sensor.f_mod_hz))
+
+
+@pytest.mark.parametrize("n", [0, 5, 15])
+def test_a_run_knows_flow_and_static_layer(run, n):
+    """The flow is that of the box; the static layer, rendered alone, is the wall wherever it was
+    seen; at both ends there are fewer raw frames.
+    """
+    passing = passing_of(run, n)
+    others = [m for m in range(max(n - 3, 0), min(n + 4, 16)) if m != n]
+    assert passing.later.tolist() == pytest.approx([m - n for m in others])
+    np.testing.assert_array_equal(passing.quads, run.sequence().quads[others])
+    inside = passing.moving > 0.9
+    assert inside.sum() > 50
+    apart = passing.flow / passing.moving - torch.tensor(flow(n, 1))
+    assert apart[:, inside].abs().mean() < 0.2
+    assert passing.opacity.median() > 0.9
+    wall = ~torch.tensor(seen(n)[2])
+    re, im, _ = run.renderer(("phasor",), corrected=False)(
+        float(run.sequence().times[n]), run.camera
+    ).phasor
+    same = (passing.behind - torch.complex(re, im))[wall & (passing.moving < 0.05)]
+    assert same.abs().max() < 0.1 * passing.behind.abs().max()
+
+
+def test_a_rendering_at_a_raw_frame_uses_it(run):
+    """Its distances are those of the parts together, and others without other raw frames."""
+    sequence, camera, sensor = run.sequence(), run.camera, run.sensor
+    time, f_mod_hz = float(sequence.times[5]), float(sensor.f_mod_hz)
+    fitted = run.renderer(("distance", "phasor"), corrected=False)(time, camera)
+    rendering = run.fallback.applied(fitted, time, camera)
+    measured = MeasuredPhasors.of(sequence, camera, run.field.device)
+    phasor = replace(measured, averaged=run.fallback.rests).corrected(
+        rendering, time, camera, f_mod_hz
+    )
+    passing = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
+    given = run.corrected(fitted, time, camera).distance
+    parts, without = (
+        outlines.resolved(rendering, sensor, phasor, passing=which).distance
+        for which in (passing, None)
+    )
+    torch.testing.assert_close(given, parts)
+    differs = (given - without).abs() > 0.01
+    assert 0.002 < differs.float().mean() < 0.05
+    assert passing.moving[differs].min() > 0.01
+
+
+def test_other_recordings_and_views_are_left_out(run):
+    """Phasors, several frequencies, a moving camera, no windows; times between raw frames, raw
+    frames that were not measured, other cameras.
+    """
+    sequence = run.sequence()
+    assert passing_of(run, 5) is not None
+    poses = sequence.camera_from_world.copy()
+    poses[8:, 0, 3] += 0.1
+    frequencies = np.repeat([20e6, 16e6] * 2, 4)
+    for other in (
+        as_phasors(sequence),
+        changed(sequence, camera_from_world=poses),
+        changed(sequence, frequencies_hz=frequencies),
+    ):
+        assert passing_of(run, 5, sequence=other) is None
+    still = Still(torch.tensor([0.0, 1.0]))
+    assert passing_of(replace(run, motion=still, binding=still.bind(run.field)), 5) is None
+    compared = replace(run, config=run.config | {"input": "phasor"})
+    assert passing_of(compared, 5) is None
+    measured = np.arange(sequence.frames) != 5
+    assert passing_of(run, 5, sequence=replace(sequence, measured=measured)) is None
+    assert passing_of(run, 5, time=5.5 / FRAME_RATE_HZ) is None
+    assert passing_of(run, 5, camera=run.camera.resized(24, 18)) is None
+    pose = np.eye(4)
+    pose[0, 3] = 0.1
+    assert passing_of(run, 5, camera=run.camera.at(pose)) is None
