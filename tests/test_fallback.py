@@ -176,6 +176,10 @@ def test_one_phasor_is_enough_where_the_camera_moves(box, carried, factor):
     """
     _, quads, truth = box
     found = fallback_of(carried, factor * quads)
+    assert found.averages == (factor == 1.0), (
+        "a fit is averaged with the closed form if it is sound"
+    )
+    assert not fallback_of(box[0], factor * quads).averages, "and if the camera moves"
     camera = found.camera.at(carried.camera_from_world[13])
     given = found.applied(rendering(truth[13] + 1.0), 13 / FRAME_RATE_HZ, camera)
     source = given.source.numpy()

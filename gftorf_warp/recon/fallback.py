@@ -54,6 +54,9 @@ from .residuals import CHI_SQUARE_MAX, Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
+UNEXPLAINED_SOUND = (
+    0.12  # [1] of the pixels, at most, of a fit that is averaged with the closed form
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,6 +81,8 @@ class Fallback:
     """Where the temporal mean may be one of two surfaces."""
     explained: Bool[Tensor, "Q H W"]
     """Where the fit explains the quads."""
+    sound: bool
+    """Whether the fit explains the quads of most pixels."""
 
     @classmethod
     def of(
@@ -134,12 +139,18 @@ class Fallback:
             moved=tensor(moved),
             mixed=tensor(near_steps(mean) | np.stack([_at_outlines(image) for image in mean])),
             explained=tensor(explained),
+            sound=residuals.unexplained_share <= UNEXPLAINED_SOUND,
         )
 
     @property
     def camera_moves(self) -> bool:
         """Whether it does, so that there is no temporal mean."""
         return not temporal.camera_rests(self.sequence)
+
+    @property
+    def averages(self) -> bool:
+        """Whether the closed form is averaged with the fit: of a moving camera, if it is sound."""
+        return self.camera_moves and self.sound
 
     def applied(self, rendering: Rendering, time: float, camera: Camera) -> Rendering:
         """A rendering with its distance replaced where the measurement knows better.

@@ -47,8 +47,8 @@ GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
 FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
 BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
 EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
-HALF = 0.5  # [1] of the change of a closed form that is kept where the camera moves
-QUARTER = 0.25  # [1] of the fit in the distance there
+HALF = 0.5  # [1] of the change of a closed form that is kept
+QUARTER = 0.25  # [1] of the fit in a closed form that it is averaged with
 ANY = 1.0 / math.pi  # density of any phasor in a unit disc
 LEAST = 1e-12  # [quad units] below it a neighbour is black
 MARGIN = 3  # [pixels] to the farthest neighbour
@@ -59,6 +59,7 @@ def resolved(
     sensor: Sensor,
     phasor: Phasor | None = None,
     *,
+    camera_moves: bool = False,
     fitted: Float[Tensor, "H W"] | None = None,
     passing: Passing | None = None,
 ) -> Rendering:
@@ -68,10 +69,11 @@ def resolved(
         rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
         phasor: The phasor as well as it is known; None: as it is rendered.
-        fitted: Distance before a fallback, where the camera moves. Then the closed form is resolved
-            too, by half, since where the odds are wrong a distance between two surfaces costs less
-            than the wrong one of them; and a quarter of the result is the fit's, which has other
-            errors, as far as it is within the distances around a pixel. None: closed forms stay.
+        camera_moves: Whether the closed form of a fallback is resolved too, by half: what
+            ``phasor`` decodes to has less noise than the closed form, and where the odds are wrong,
+            a distance between two surfaces costs less than the wrong one of them.
+        fitted: Distance before a fallback, of which a quarter is in those resolved closed forms, as
+            far as it is within the distances around a pixel: its errors are others. None: none.
         passing: What other raw frames tell of moving outlines; None: nothing.
 
     Returns:
@@ -82,15 +84,14 @@ def resolved(
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
     lit = rendering.phasor[2] > 0.0
     where = (source == 0) & lit  # the others are measured, or black
-    closed_form = (source == CLOSED_FORM) & lit
-    if fitted is not None:  # what the phasor decodes to has less noise than the closed form
+    closed_form = (source == CLOSED_FORM) & lit & camera_moves
+    if camera_moves:
         fit = torch.where(closed_form, phasor.decoded(fit, sensor), fit)
         where |= closed_form
     distance = fit
     for _ in range(PASSES):
         distance = _resolved(distance, phasor, where, sensor, passing)
-    if fitted is not None:
-        distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
+    distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
     changed = (distance - fit).abs() > 0.01 * STEP_M
     if fitted is not None:
         low, high = extremes(distance)

@@ -146,18 +146,21 @@ class Run(StoredRun):
             return rendering
         fitted = None
         if self.fallback is not None:
-            fitted = rendering.distance if self.fallback.camera_moves else None
+            fitted = rendering.distance if self.fallback.averages else None
             rendering = self.fallback.applied(rendering, time, camera)
         sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
         phasor = None
         if measured is not None:
             phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
         if self.config["settings"].get("outlines") and not light_only:
+            moves = self.fallback is not None and self.fallback.camera_moves
             passing = None
             if self._moving_outlines is not None:
                 frequency = float(sensor.f_mod_hz)
                 passing = self._moving_outlines.at(rendering, time, camera, frequency)
-            rendering = outlines.resolved(rendering, sensor, phasor, fitted=fitted, passing=passing)
+            rendering = outlines.resolved(
+                rendering, sensor, phasor, camera_moves=moves, fitted=fitted, passing=passing
+            )
         if phasor is None or self.fallback is None:
             return rendering
         return phasor.within(rendering, sensor)
