@@ -84,12 +84,12 @@ def _begun_again(
         raise DivergedError(
             "the volume is empty",
             where=f"{out}, step {state.images}",
-            why=f"no ray meets anything, so nothing has a gradient; the run began again "
-            f"{state.restarts} times",
+            why=f"hardly any ray meets anything, so hardly anything has a gradient; the run began "
+            f"again {state.restarts} times",
             fix="lower the learning rate by --set volume.rate=1e-4, or start over with another "
             "--seed and --fresh",
         )
-    text = "after %d steps no ray meets anything: the run begins again with another seed"
+    text = "after %d steps hardly any ray meets anything: the run begins again with another seed"
     LOG.warning(text, state.images)
     again = begin(settings, targets, seed + SEED_STEP * number, state.volume.device)
     again.restarts = number

@@ -20,9 +20,12 @@ from .step import VolumeStep
 LOG = logging.getLogger("gftorf_warp")
 
 
+EMPTY = 0.01  # [1] mean opacity of a volume below which it is empty
+
+
 class EmptyVolumeError(Exception):
-    """No ray met anything since the last row of metrics, noise on the densities included: nothing
-    has a gradient any more.
+    """Hardly any ray met anything since the last row of metrics, noise on the densities included: so
+    hardly anything has a gradient. What is closed behind is opaque elsewhere.
     """
 
 
@@ -129,7 +132,7 @@ class VolumeLoop:
         state.counts.clear()
         if not math.isfinite(means["loss"]):
             raise self._diverged("the loss is not finite")
-        if means.get("opacity") == 0.0:
+        if means.get("opacity", 1.0) < EMPTY:
             raise EmptyVolumeError
         mse = means.pop("quad_mse", 0.0)
         psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
