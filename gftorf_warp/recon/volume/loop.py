@@ -24,8 +24,8 @@ EMPTY = 0.01  # [1] mean opacity of a volume below which it is empty
 
 
 class EmptyVolumeError(Exception):
-    """Hardly any ray met anything since the last row of metrics, noise on the densities included: so
-    hardly anything has a gradient. What is closed behind is opaque elsewhere.
+    """Hardly any ray met anything since the last row of metrics, noise on the densities included:
+    so hardly anything has a gradient. What is closed behind is opaque elsewhere.
     """
 
 
