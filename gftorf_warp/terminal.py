@@ -184,14 +184,25 @@ def print_error(error: BaseException, *, debug: bool) -> int:
     if known is not None:
         print(f"error: {_shortened(str(known))}", file=sys.stderr)
         return known.exit_code
-    if isinstance(error, KeyboardInterrupt):
-        how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
+    stop = _stop_behind(error)
+    if stop is not None:
+        how, code = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
         print(f"{how}: finished work is kept; the same command resumes it", file=sys.stderr)
         return code
     summary = (str(error).splitlines() or [""])[0]
     hint = "" if debug else "; --debug shows where"
     print(f"error: unexpected {type(error).__name__}: {summary}{hint}", file=sys.stderr)
     return 1
+
+
+def _stop_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """The signal that an error came of: a bare ``except`` of a library, as Warp has in arrays of
+    structs, makes another error of it.
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__context__
+    return cause
 
 
 def _shortened(text: str) -> str:

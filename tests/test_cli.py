@@ -15,7 +15,14 @@ import numpy as np
 import pytest
 
 from gftorf_warp import __version__, cli, options
-from gftorf_warp.errors import BusyError, DivergedError, InputError, ResourceError, UsageError
+from gftorf_warp.errors import (
+    BusyError,
+    DivergedError,
+    InputError,
+    ResourceError,
+    Terminated,
+    UsageError,
+)
 from gftorf_warp.evaluate.printed import table
 
 SIZE, FRAMES = "32x24", "8"
@@ -290,6 +297,23 @@ def test_interruption_ends_with_130(monkeypatch, capsys):
     _, err = lines_of(capsys)
     assert len(err) == 1
     assert err[0].startswith("interrupted")
+
+
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt, 130), (Terminated, 143)])
+def test_interruption_that_a_library_turns_into_an_error_is_one(monkeypatch, capsys, stop, code):
+    """Warp makes a RuntimeError of what stops the assembly of an array of structs."""
+
+    def command(_):
+        try:
+            raise stop
+        except BaseException:
+            raise RuntimeError("Invalid source data type for array of structs")  # noqa: B904
+
+    monkeypatch.setitem(cli.COMMANDS, "check", command)
+    assert cli.main(["check", "SEQ"]) == code
+    _, err = lines_of(capsys)
+    assert len(err) == 1
+    assert err[0].endswith("the same command resumes it")
 
 
 def test_cuda_asked_for_and_absent(monkeypatch, capsys):
