@@ -54,9 +54,7 @@ from .residuals import CHI_SQUARE_MAX, Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
-UNEXPLAINED_SOUND = (
-    0.12  # [1] of the pixels, at most, of a fit that is averaged with the closed form
-)
+UNEXPLAINED_SOUND = 0.12  # [1] of the pixels, of a fit that is averaged with the closed form
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -203,10 +203,11 @@ class Volume(torch.nn.Module, abc.ABC):
             colour=alpha[..., None] * light.colour if colour else None,
         )
 
+    @torch.no_grad()
     def noted(self, mse: Tensor, samples: Samples) -> dict[str, Tensor]:
         """What ``NOTED`` names, without gradients."""
         opacity = composite.opacity(samples, samples.transmittance).mean()
-        return dict(zip(NOTED, (mse.detach(), opacity.detach()), strict=True))
+        return dict(zip(NOTED, (mse.detach(), opacity), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values and tensors, for a checkpoint."""
