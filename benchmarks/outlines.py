@@ -8,7 +8,7 @@ the sequence's path under OUT. A SEQUENCE named random-N that does not exist is 
 engine mesh at 96x72, 24 raw frames. `score` prints the error of d over that of the closed form on
 the same pixels, geometric means over the sequences of one parent folder, on every fifth raw frame,
 for all, moving and static pixels and for the static ones beside steps and elsewhere: of the
-fallback alone, with outlines, and with constants of recon/outlines.py, recon/passing.py,
+fallback alone, with outlines, and with constants of recon/outlines.py, recon/other_frames.py,
 recon/phasors.py or recon/straight.py changed (several in one SPEC by commas).
 """
 
@@ -30,7 +30,7 @@ from gftorf_warp.data.steps import near_steps
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
-from gftorf_warp.recon import outlines, passing, phasors, straight
+from gftorf_warp.recon import other_frames, outlines, phasors, straight
 from gftorf_warp.recon.raw_frames import RawFrames
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
@@ -38,7 +38,12 @@ from gftorf_warp.sim.random_scene import random_scene
 
 SIZE, FRAMES = (96, 72), 24  # of simulated scenes
 FIRST, EVERY = 2, 5  # [raw frames] scored ones: their slots differ
-MODULES = {"outlines": outlines, "passing": passing, "phasors": phasors, "straight": straight}
+MODULES = {
+    "outlines": outlines,
+    "other_frames": other_frames,
+    "phasors": phasors,
+    "straight": straight,
+}
 Stored = dict[str, Any]
 
 
@@ -114,7 +119,7 @@ def rule(stored: Stored, spec: str) -> Callable[[int, Rendering], torch.Tensor]:
         camera = camera_at(run, run.sequence(), time)
         phasor = measured and measured.corrected(rendering, time, camera, frequency)
         others = moving and moving.at(rendering, time, camera, frequency)
-        return outlines.resolved(rendering, run.sensor, phasor, passing=others).distance
+        return outlines.resolved(rendering, run.sensor, phasor, others=others).distance
 
     return resolved
 

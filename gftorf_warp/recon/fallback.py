@@ -30,6 +30,7 @@ which.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -140,7 +141,7 @@ class Fallback:
             sound=residuals.unexplained_share <= UNEXPLAINED_SOUND,
         )
 
-    @property
+    @functools.cached_property
     def camera_moves(self) -> bool:
         """Whether it does, so that there is no temporal mean."""
         return not temporal.camera_rests(self.sequence)

@@ -15,7 +15,7 @@ its position does, see straight.py. So every share has a likelihood, and the dis
 both surfaces' distances, weighted by the odds that the centre is on them. Pairs of neighbours in
 four directions vote with their likelihoods, against a surface of the pixel's own, of which any
 phasor is as likely: its distance is the rendered one. The phasor is not only rendered, see
-phasors.py, and of a moving outline other raw frames tell more, see passing.py.
+phasors.py, and of a moving outline other raw frames tell more, see other_frames.py.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..data.steps import STEP_M
 from ..render.api import Rendering
 from ..scene.measured import extremes
 from ..scene.sensor import Sensor
-from .passing import Passing, evidence
+from .other_frames import OtherFrames, log_likelihood
 from .phasors import CLOSED_FORM, Phasor, rendered_phasor
 from .straight import Outline, along_outline
 
@@ -61,7 +61,7 @@ def resolved(
     *,
     camera_moves: bool = False,
     fitted: Float[Tensor, "H W"] | None = None,
-    passing: Passing | None = None,
+    others: OtherFrames | None = None,
 ) -> Rendering:
     """A rendering with the distances of its mixed pixels resolved.
 
@@ -74,7 +74,7 @@ def resolved(
             a distance between two surfaces costs less than the wrong one of them.
         fitted: Distance before a fallback, of which a quarter is in those resolved closed forms, as
             far as it is within the distances around a pixel: its errors are others. None: none.
-        passing: What other raw frames tell of moving outlines; None: nothing.
+        others: What other raw frames tell of moving outlines; None: nothing.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
@@ -90,7 +90,7 @@ def resolved(
         where |= closed_form
     distance = fit
     for _ in range(PASSES):
-        distance = _resolved(distance, phasor, where, sensor, passing)
+        distance = _resolved(distance, phasor, where, sensor, others)
     distance = torch.where(closed_form, torch.lerp(fit, distance, HALF), distance)
     changed = (distance - fit).abs() > 0.01 * STEP_M
     if fitted is not None:
@@ -124,7 +124,7 @@ def _resolved(
     phasor: Phasor,
     where: Bool[Tensor, "H W"],
     sensor: Sensor,
-    passing: Passing | None,
+    others: OtherFrames | None,
 ) -> Float[Tensor, "H W"]:
     """One pass over the pixels ``where`` a distance may change."""
     amplitude = phasor.value.abs().clamp_min(LEAST)
@@ -144,9 +144,9 @@ def _resolved(
         each = [_likelihood(phasor, pixels, unit, sides, sensor) for sides in of_gains]
         outline = Outline(after, pixels, first.distance, second.distance, distance, SMOOTH)
         alone = torch.stack(each) / SHARES
-        if passing is not None:
+        if others is not None:
             amplitudes = first.amplitude, second.amplitude
-            alone *= evidence(passing, outline, amplitudes, gains, shares, sensor).exp()
+            alone *= log_likelihood(others, outline, amplitudes, gains, shares, sensor).exp()
         likelihood = along_outline(alone, chances, ANY, outline)
         odds = (likelihood * on_first[:, None]).sum(dim=0)
         both = likelihood.sum(dim=0)

@@ -345,8 +345,8 @@ UNREAD = ("attempts_max", "failures_max", "rollbacks_max")
 GAUSSIANS_ONLY = ("fallback", "outlines", *UNREAD)
 """Settings that no other method can change; there are runs that state those of ``UNREAD``, which no
 other method ever read."""
-RESTARTED_ONLY = ("restarts_max",)
-"""Settings that Gaussians and volumes have."""
+FITTED_ONLY = ("restarts_max",)
+"""Settings that methods without a fit cannot change."""
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

@@ -29,7 +29,7 @@ from .loop import Progress, TrainingLoop
 from .observations import former_hash, input_of, observe
 from .record import Metrics, log_to
 from .run import Run
-from .settings import GAUSSIANS_ONLY, RESTARTED_ONLY, FlowSource, Input, Method, ReconSettings
+from .settings import FITTED_ONLY, GAUSSIANS_ONLY, FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict
 from .suitable import check_sequence, faithfulness, log_faithfulness
 from .volume import fit
@@ -157,10 +157,10 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
         )
     names: tuple[str, ...] = () if settings.method == Method.GAUSSIANS else GAUSSIANS_ONLY
     if not settings.method.fits:
-        names += RESTARTED_ONLY
+        names += FITTED_ONLY
     unfit = [n for n in names if getattr(settings, n) != getattr(ReconSettings, n)]
     if unfit:
-        who = "Gaussians and volumes" if unfit[0] in RESTARTED_ONLY else "Gaussians"
+        who = "Gaussians and volumes" if unfit[0] in FITTED_ONLY else "Gaussians"
         what, why = f"{unfit[0]} does not fit preset {settings.preset}", f"only {who} have it"
         raise UsageError(what, where="--set", why=why, fix=f"leave {unfit[0]} out")
     wanted = None

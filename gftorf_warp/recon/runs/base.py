@@ -154,12 +154,12 @@ class Run(StoredRun):
             phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
         if self.config["settings"].get("outlines") and not light_only:
             moves = self.fallback is not None and self.fallback.camera_moves
-            passing = None
+            others = None
             if self._moving_outlines is not None:
                 frequency = float(sensor.f_mod_hz)
-                passing = self._moving_outlines.at(rendering, time, camera, frequency)
+                others = self._moving_outlines.at(rendering, time, camera, frequency)
             rendering = outlines.resolved(
-                rendering, sensor, phasor, camera_moves=moves, fitted=fitted, passing=passing
+                rendering, sensor, phasor, camera_moves=moves, fitted=fitted, others=others
             )
         if phasor is None or self.fallback is None:
             return rendering

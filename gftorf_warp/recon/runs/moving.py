@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from ...data.temporal import camera_rests
@@ -17,7 +17,7 @@ from ...scene.measured import frame_period
 from ...scene.windows import Windows
 from .. import closed_form
 from ..observations import input_of
-from ..passing import SPAN, Passing, normals_of
+from ..other_frames import SPAN, OtherFrames, normals_of
 from ..phasors import MeasuredPhasors
 from ..settings import Input
 from .gaussians import widened
@@ -51,7 +51,7 @@ class MovingOutlines:
     @torch.no_grad()
     def at(
         self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float
-    ) -> Passing | None:
+    ) -> OtherFrames | None:
         """What other raw frames measured of the outlines of a rendering.
 
         Args:
@@ -72,26 +72,25 @@ class MovingOutlines:
         if closed_form.another_view(sequence, time, camera, self.measured.camera):
             return None
         near = range(max(n - SPAN, 0), min(n + SPAN + 1, sequence.frames))
-        others = [m for m in near if m != n and sequence.measured[m]]
-        if not others:
+        frames = [m for m in near if m != n and sequence.measured[m]]
+        if not frames:
             return None
-        (moving, *flow), static = self._flow(time, camera), self._static
-        re, im, _ = static.phasor / self.run.quad_scale
+        (moving, *flow), (behind, opacity) = self._flow(time, camera), self._static
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=moving.device, dtype=torch.float32)
 
-        later = (sequence.times[others] - sequence.times[n]) / frame_period(sequence)
-        slots = [m % sequence.cycle for m in others]
-        return Passing(
-            quads=tensor(sequence.quads[others]),
+        later = (sequence.times[frames] - sequence.times[n]) / frame_period(sequence)
+        slots = [m % sequence.cycle for m in frames]
+        return OtherFrames(
+            quads=tensor(sequence.quads[frames]),
             variance=self.measured.of_quads[slots],
-            shifts=tensor(sequence.shifts[others]),
+            shifts=tensor(sequence.shifts[frames]),
             later=tensor(later),
             moving=moving,
             flow=torch.stack(flow),
-            behind=torch.complex(re, im),
-            opacity=static.opacity,
+            behind=behind,
+            opacity=opacity,
             normals=normals_of(rendering.distance),
         )
 
@@ -121,15 +120,17 @@ class MovingOutlines:
         return rendering.extra
 
     @functools.cached_property
-    def _static(self) -> Rendering:
-        """Phasor and opacity of the static layer alone, in the units of the optimisation."""
+    def _static(self) -> tuple[Complex[Tensor, "H W"], Float[Tensor, "H W"]]:
+        """Phasor [quad units] and opacity of the static layer alone."""
         run, camera = self.run, self.measured.camera
         rows: Int[Tensor, "S"] = (run.binding[:, 0] == 0.0).nonzero()[:, 0]
         field = replace(run.field.map(lambda values: values[rows]), colour_sh=None)
-        return rasterize(
+        rendering = rasterize(
             widened(run, field, camera),
             camera,
             run.sensor,
             run.render_settings,
             images=("phasor", "opacity"),
         )
+        re, im, _ = rendering.phasor / run.quad_scale
+        return torch.complex(re, im), rendering.opacity

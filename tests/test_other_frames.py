@@ -11,7 +11,7 @@ from sequences import changed
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
 from gftorf_warp.data.write import write
 from gftorf_warp.recon import outlines, presets
-from gftorf_warp.recon.passing import Passing, evidence, normals_of
+from gftorf_warp.recon.other_frames import OtherFrames, log_likelihood, normals_of
 from gftorf_warp.recon.phasors import MeasuredPhasors, Phasor
 from gftorf_warp.recon.runs.moving import MovingOutlines
 from gftorf_warp.recon.straight import Outline
@@ -75,10 +75,10 @@ class MovingEdge:
         self.truth = np.where(centre, NEAR, FAR)
         self.rendered = NEAR * self.share + FAR * (1.0 - self.share)
 
-    def passing(self, moves=1.0):
+    def others(self, moves=1.0):
         """What is known of it, if the near surface has this weight of moving Gaussians."""
         moving = moves * tensor(self.share)
-        return Passing(
+        return OtherFrames(
             quads=tensor(self.quads),
             variance=torch.full((len(OTHERS), HEIGHT, WIDTH), NOISE**2),
             shifts=tensor(self.shifts),
@@ -148,7 +148,7 @@ def test_other_raw_frames_tell_the_share(velocity, left):
     """Whatever the velocity, and on whichever side the surface in front is."""
     edge = MovingEdge(velocity, left)
     outline, amplitudes, true = mixed_pixels(edge)
-    given = evidence(edge.passing(), outline, amplitudes, GAINS, SHARES, SENSOR)
+    given = log_likelihood(edge.others(), outline, amplitudes, GAINS, SHARES, SENSOR)
     torch.testing.assert_close(given.exp().mean(dim=(0, 1)), torch.ones_like(true))
     apart = (likeliest(given) - true).abs()
     assert apart.mean() < 0.1
@@ -162,8 +162,8 @@ def test_fewer_mixed_pixels_are_on_the_wrong_side(velocity):
     wrong = {"without": 0, "with": 0}
     for seed in range(10):
         rendering, phasor = edge.rendering(error=0.3, seed=seed)
-        for name, passing in (("without", None), ("with", edge.passing())):
-            given = outlines.resolved(rendering, SENSOR, phasor, passing=passing)
+        for name, others in (("without", None), ("with", edge.others())):
+            given = outlines.resolved(rendering, SENSOR, phasor, others=others)
             apart = abs(given.distance.numpy() - edge.truth)
             wrong[name] += (apart > 0.5 * (FAR - NEAR))[mixed].sum()
     assert wrong["with"] < 0.7 * wrong["without"]
@@ -177,20 +177,20 @@ def test_where_nothing_moves_nothing_is_told():
     outline, amplitudes, _ = mixed_pixels(edge)
     rendering, phasor = edge.rendering()
     alone = outlines.resolved(rendering, SENSOR, phasor).distance
-    passing = edge.passing()
-    along = passing.normals.flip(0) * torch.tensor([0.1, 1.0])[:, None, None]
+    others = edge.others()
+    along = others.normals.flip(0) * torch.tensor([0.1, 1.0])[:, None, None]
     for nothing in (
-        edge.passing(moves=0.2),
-        replace(passing, flow=20.0 * passing.flow),
-        replace(passing, normals=along),
+        edge.others(moves=0.2),
+        replace(others, flow=20.0 * others.flow),
+        replace(others, normals=along),
     ):
-        given = evidence(nothing, outline, amplitudes, GAINS, SHARES, SENSOR)
+        given = log_likelihood(nothing, outline, amplitudes, GAINS, SHARES, SENSOR)
         assert given.shape == (len(GAINS), len(SHARES), len(outline.first))
         assert not given.any()
-    still = outlines.resolved(rendering, SENSOR, phasor, passing=edge.passing(moves=0.2))
+    still = outlines.resolved(rendering, SENSOR, phasor, others=edge.others(moves=0.2))
     assert torch.equal(still.distance, alone)
     assert not torch.equal(
-        outlines.resolved(rendering, SENSOR, phasor, passing=passing).distance, alone
+        outlines.resolved(rendering, SENSOR, phasor, others=others).distance, alone
     )
 
 
@@ -198,18 +198,18 @@ def test_an_outline_that_leaves_the_image_tells_nothing():
     """All its other positions are outside."""
     edge = MovingEdge(-1.3)
     cut = slice(19, 24)  # columns; the outline has left them after few raw frames
-    passing = edge.passing()
+    others = edge.others()
     names = ("quads", "variance", "moving", "flow", "behind", "opacity", "normals")
-    passing = replace(passing, **{name: getattr(passing, name)[..., cut] for name in names})
+    others = replace(others, **{name: getattr(others, name)[..., cut] for name in names})
     outline, amplitudes, _ = mixed_pixels(edge)
     near = outline.pixels[1] < 21
     pixels = outline.pixels[0][near], outline.pixels[1][near] - cut.start
     first, second = outline.first[near], outline.second[near]
     inside = outline._replace(pixels=pixels, first=first, second=second)
     sides = [amplitude[near] for amplitude in amplitudes]
-    far = replace(passing, later=100.0 * passing.later)
-    assert not evidence(far, inside, sides, GAINS, SHARES, SENSOR).any()
-    assert evidence(passing, inside, sides, GAINS, SHARES, SENSOR).isfinite().all()
+    far = replace(others, later=100.0 * others.later)
+    assert not log_likelihood(far, inside, sides, GAINS, SHARES, SENSOR).any()
+    assert log_likelihood(others, inside, sides, GAINS, SHARES, SENSOR).isfinite().all()
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +223,7 @@ def run(tmp_path_factory):
     return reconstruct(folder / "box", folder / "run", settings)
 
 
-def passing_of(run, n, sequence=None, camera=None, time=None):
+def others_of(run, n, sequence=None, camera=None, time=None):
     """What is known of the outlines of raw frame n of a run, or of its other sequence."""
     sequence = sequence or run.sequence()
     measured = MeasuredPhasors.of(sequence, run.camera, run.field.device)
@@ -241,21 +241,21 @@ def test_a_run_knows_flow_and_static_layer(run, n):
     """The flow is that of the box; the static layer, rendered alone, is the wall wherever it was
     seen; at both ends there are fewer raw frames.
     """
-    passing = passing_of(run, n)
-    others = [m for m in range(max(n - 3, 0), min(n + 4, 16)) if m != n]
-    assert passing.later.tolist() == pytest.approx([m - n for m in others])
-    np.testing.assert_array_equal(passing.quads, run.sequence().quads[others])
-    inside = passing.moving > 0.9
+    others = others_of(run, n)
+    frames = [m for m in range(max(n - 3, 0), min(n + 4, 16)) if m != n]
+    assert others.later.tolist() == pytest.approx([m - n for m in frames])
+    np.testing.assert_array_equal(others.quads, run.sequence().quads[frames])
+    inside = others.moving > 0.9
     assert inside.sum() > 50
-    apart = passing.flow / passing.moving - torch.tensor(flow(n, 1))
+    apart = others.flow / others.moving - torch.tensor(flow(n, 1))
     assert apart[:, inside].abs().mean() < 0.2
-    assert passing.opacity.median() > 0.9
+    assert others.opacity.median() > 0.9
     wall = ~torch.tensor(seen(n)[2])
     re, im, _ = run.renderer(("phasor",), corrected=False)(
         float(run.sequence().times[n]), run.camera
     ).phasor
-    same = (passing.behind - torch.complex(re, im))[wall & (passing.moving < 0.05)]
-    assert same.abs().max() < 0.1 * passing.behind.abs().max()
+    same = (others.behind - torch.complex(re, im))[wall & (others.moving < 0.05)]
+    assert same.abs().max() < 0.1 * others.behind.abs().max()
 
 
 def test_a_rendering_at_a_raw_frame_uses_it(run):
@@ -268,16 +268,16 @@ def test_a_rendering_at_a_raw_frame_uses_it(run):
     phasor = replace(measured, averaged=run.fallback.rests).corrected(
         rendering, time, camera, f_mod_hz
     )
-    passing = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
+    others = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
     given = run.corrected(fitted, time, camera).distance
     parts, without = (
-        outlines.resolved(rendering, sensor, phasor, passing=which).distance
-        for which in (passing, None)
+        outlines.resolved(rendering, sensor, phasor, others=which).distance
+        for which in (others, None)
     )
     torch.testing.assert_close(given, parts)
     differs = (given - without).abs() > 0.01
     assert 0.002 < differs.float().mean() < 0.05
-    assert passing.moving[differs].min() > 0.01
+    assert others.moving[differs].min() > 0.01
 
 
 def test_other_recordings_and_views_are_left_out(run):
@@ -285,7 +285,7 @@ def test_other_recordings_and_views_are_left_out(run):
     frames that were not measured, other cameras.
     """
     sequence = run.sequence()
-    assert passing_of(run, 5) is not None
+    assert others_of(run, 5) is not None
     poses = sequence.camera_from_world.copy()
     poses[8:, 0, 3] += 0.1
     frequencies = np.repeat([20e6, 16e6] * 2, 4)
@@ -294,15 +294,15 @@ def test_other_recordings_and_views_are_left_out(run):
         changed(sequence, camera_from_world=poses),
         changed(sequence, frequencies_hz=frequencies),
     ):
-        assert passing_of(run, 5, sequence=other) is None
+        assert others_of(run, 5, sequence=other) is None
     still = Still(torch.tensor([0.0, 1.0]))
-    assert passing_of(replace(run, motion=still, binding=still.bind(run.field)), 5) is None
+    assert others_of(replace(run, motion=still, binding=still.bind(run.field)), 5) is None
     compared = replace(run, config=run.config | {"input": "phasor"})
-    assert passing_of(compared, 5) is None
+    assert others_of(compared, 5) is None
     measured = np.arange(sequence.frames) != 5
-    assert passing_of(run, 5, sequence=replace(sequence, measured=measured)) is None
-    assert passing_of(run, 5, time=5.5 / FRAME_RATE_HZ) is None
-    assert passing_of(run, 5, camera=run.camera.resized(24, 18)) is None
+    assert others_of(run, 5, sequence=replace(sequence, measured=measured)) is None
+    assert others_of(run, 5, time=5.5 / FRAME_RATE_HZ) is None
+    assert others_of(run, 5, camera=run.camera.resized(24, 18)) is None
     pose = np.eye(4)
     pose[0, 3] = 0.1
-    assert passing_of(run, 5, camera=run.camera.at(pose)) is None
+    assert others_of(run, 5, camera=run.camera.at(pose)) is None

@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
-from ..scene.sensor import Sensor
+from ..scene.sensor import Sensor, quad_from_phasor
 from .straight import Outline
 
 SPAN = 3  # [raw frames] before and after that are compared
@@ -47,7 +47,7 @@ CORNER_MIN = 1e-6  # [1] likewise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Passing:
+class OtherFrames:
     """What other raw frames measured of outlines that pass through one raw frame."""
 
     quads: Float[Tensor, "M H W"]
@@ -81,8 +81,8 @@ def normals_of(distance: Float[Tensor, "H W"]) -> Float[Tensor, "2 H W"]:
     return gradient / gradient.norm(dim=0).clamp_min(SLOPE_MIN)
 
 
-def evidence(
-    passing: Passing,
+def log_likelihood(
+    others: OtherFrames,
     outline: Outline,
     amplitudes: tuple[Float[Tensor, "P"], Float[Tensor, "P"]],
     gains: Float[Tensor, "g"],
@@ -93,7 +93,7 @@ def evidence(
     everywhere in pixels where no outline of a moving surface is followed.
 
     Args:
-        passing: What other raw frames measured.
+        others: What other raw frames measured.
         outline: Mixed pixels.
         amplitudes: Of the phasors of the first and second surface, without gain [quad units].
         gains: Of the strip of the surface in front beside its outline [1].
@@ -101,11 +101,11 @@ def evidence(
         sensor: Whose first frequency is that of the quads.
     """
     result = outline.first.new_zeros(len(gains), len(shares), len(outline.first))
-    index, moving = _moving(passing, outline, amplitudes, sensor)
+    index, moving = _moving(others, outline, amplitudes, sensor)
     if not len(index):
         return result
-    looks = _looks(passing, moving, outline)
-    likelihood = _log_likelihood(passing, moving, looks, gains, shares, sensor)
+    samples = _sampled(others, moving, outline)
+    likelihood = _of_gains_and_shares(others, moving, samples, gains, shares, sensor)
     mean = likelihood.flatten(0, 1).logsumexp(dim=0) - math.log(len(gains) * len(shares))
     result[:, :, index] = likelihood - mean
     return result
@@ -135,17 +135,17 @@ class _Moving(NamedTuple):
 
 
 def _moving(
-    passing: Passing,
+    others: OtherFrames,
     outline: Outline,
     amplitudes: tuple[Float[Tensor, "P"], Float[Tensor, "P"]],
     sensor: Sensor,
 ) -> tuple[Int[Tensor, "m"], _Moving]:
     """Which of P pixels are at outlines that can be followed, and what is known of them."""
     first = outline.first < outline.second
-    weight, x, y = _beside(torch.cat([passing.moving[None], passing.flow]), outline, first)
-    weight_behind = _beside(passing.moving[None], outline, ~first)[0]
+    weight, x, y = _beside(torch.cat([others.moving[None], others.flow]), outline, first)
+    weight_behind = _beside(others.moving[None], outline, ~first)[0]
     row, column = outline.pixels
-    normal = passing.normals[:, row, column]
+    normal = others.normals[:, row, column]
     down, right = outline.across
     facing = right * normal[0] + down * normal[1]
     normal = torch.where(facing < 0.0, -normal, normal)
@@ -183,8 +183,8 @@ def _beside(
     return images[:, row, column]
 
 
-class _Looks(NamedTuple):
-    """Three pixels per raw frame at which each of P outlines is looked for: L = 3 M in all."""
+class _Samples(NamedTuple):
+    """Three pixels per raw frame around each of P outlines: L = 3 M in all."""
 
     frame: Int[Tensor, "L"]
     """Which of the M raw frames."""
@@ -199,47 +199,47 @@ class _Looks(NamedTuple):
     [steps across]."""
 
 
-def _looks(passing: Passing, moving: _Moving, outline: Outline) -> _Looks:
+def _sampled(others: OtherFrames, moving: _Moving, outline: Outline) -> _Samples:
     """The three pixels nearest to the outline in every raw frame."""
-    (height, width), device = passing.moving.shape, passing.moving.device
-    travelled = passing.later[:, None, None] * moving.velocity
+    (height, width), device = others.moving.shape, others.moving.device
+    travelled = others.later[:, None, None] * moving.velocity
     steps = travelled.round() + torch.tensor(NEAREST, device=device)[:, None]
     beyond, steps = (travelled - steps).flatten(0, 1), steps.flatten(0, 1).long()
     row = moving.row + steps * outline.across[0]
     column = moving.column + steps * outline.across[1]
-    frame = torch.arange(len(passing.later), device=device).repeat_interleave(len(NEAREST))
+    frame = torch.arange(len(others.later), device=device).repeat_interleave(len(NEAREST))
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return _Looks(frame, row.clamp(0, height - 1), column.clamp(0, width - 1), inside, beyond)
+    return _Samples(frame, row.clamp(0, height - 1), column.clamp(0, width - 1), inside, beyond)
 
 
-def _log_likelihood(
-    passing: Passing,
+def _of_gains_and_shares(
+    others: OtherFrames,
     moving: _Moving,
-    looks: _Looks,
+    samples: _Samples,
     gains: Float[Tensor, "g"],
     shares: Float[Tensor, "s"],
     sensor: Sensor,
 ) -> Float[Tensor, "g s P"]:
-    """Of each gain and share: the residuals of all looks are normal, and gains are about each."""
-    shift = passing.shifts[looks.frame][:, None]
+    """Of each gain and share: the residuals of all samples are normal, and gains are about each."""
+    shift = others.shifts[samples.frame][:, None]
     front = _quads(moving.front, shift, sensor)
-    known = moving.still & (passing.opacity[looks.row, looks.column] > SOLID)
-    layer = passing.behind[looks.row, looks.column]
+    known = moving.still & (others.opacity[samples.row, samples.column] > SOLID)
+    layer = others.behind[samples.row, samples.column]
     back = _quads(torch.where(known, layer, moving.back), shift, sensor)
-    covered, strip = _covered(moving, looks.beyond, shares)
-    drift = DRIFT * passing.later[looks.frame][:, None]
-    at = (looks.frame[:, None], looks.row, looks.column)
-    fixed = passing.variance[at] + (drift * (front - back)).square()
+    covered, strip = _covered(moving, samples.beyond, shares)
+    drift = DRIFT * others.later[samples.frame][:, None]
+    at = (samples.frame[:, None], samples.row, samples.column)
+    fixed = others.variance[at] + (drift * (front - back)).square()
     fixed = fixed + (MODEL_ERROR * torch.maximum(moving.front.abs(), moving.back.abs())).square()
     front, back, fixed = front[:, None], back[:, None], fixed[:, None]
     variance = fixed + (FRONT_SPREAD * covered * front).square()
     variance = variance + (BACK_SPREAD * (1.0 - covered) * back).square()
-    residual = passing.quads[at][:, None] - (covered - strip) * front - (1.0 - covered) * back
+    residual = others.quads[at][:, None] - (covered - strip) * front - (1.0 - covered) * back
     lit = strip * front
-    counts = WEIGHT * looks.inside[:, None] / variance
+    counts = WEIGHT * samples.inside[:, None] / variance
     square = (counts * residual.square()).sum(dim=0)
     product, lit = (counts * residual * lit).sum(dim=0), (counts * lit.square()).sum(dim=0)
-    spread = WEIGHT * (looks.inside[:, None] * variance.log()).sum(dim=0)
+    spread = WEIGHT * (samples.inside[:, None] * variance.log()).sum(dim=0)
     gain = gains[:, None, None]
     prior = (GAIN_SPREAD * gain).square()
     wider = 1.0 + prior * lit
@@ -251,8 +251,8 @@ def _quads(
     phasor: Complex[Tensor, "*n"], shift: Float[Tensor, "*n"], sensor: Sensor
 ) -> Float[Tensor, "*n"]:
     """Quads of shifts [rad] of a surface."""
-    turned = phasor.real * shift.cos() + phasor.imag * shift.sin()
-    return 0.5 * (turned + sensor.dc_offset * phasor.abs())
+    turned = phasor * torch.polar(torch.ones_like(shift), -shift)
+    return quad_from_phasor(turned.real, turned.imag, sensor.dc_offset * phasor.abs(), 0.0)
 
 
 def _covered(
