@@ -31,7 +31,7 @@ from .straight import Outline
 
 SPAN = 3  # [raw frames] before and after that are compared
 NEAREST = (-1, 0, 1)  # [steps across] pixels beside the one that the outline is in
-WEIGHT = 0.2  # [1] of the logarithm of the likelihood that counts
+WEIGHT = 0.3  # [1] of the logarithm of the likelihood that counts
 FRONT_SPREAD = 0.3  # [1] standard deviation of the amplitude in front, relative
 BACK_SPREAD = 0.3  # [1] the same of what is behind
 DRIFT = 0.1  # [steps across per raw frame] standard deviation of the velocity of an outline

@@ -16,6 +16,10 @@ both surfaces' distances, weighted by the odds that the centre is on them. Pairs
 four directions vote with their likelihoods, against a surface of the pixel's own, of which any
 phasor is as likely: its distance is the rendered one. The phasor is not only rendered, see
 phasors.py, and of a moving outline other raw frames tell more, see other_frames.py.
+
+A neighbour may be mixed itself, so only its own neighbour has to be nearer to it than the other
+side is. Steep slopes fulfil this, too: there the distance of a pixel is brought within what both
+sides continue to.
 """
 
 from __future__ import annotations
@@ -40,8 +44,9 @@ OUTLINE = 3  # in a map of sources, see fallback.py
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns)
 PASSES = 2  # the second one sees neighbours that are no mixtures any more
 SHARES = 21  # of the area of a pixel, from 0 to 1
-BLUR = 0.08  # [pixels] outlines are not straight: how sure the share makes of the centre
-SMOOTH = 0.25  # [steps] distances of two neighbours on one side differ by less
+BLUR = 0.065  # [pixels] outlines are not straight: how sure the share makes of the centre
+SMOOTH = 1.0  # [steps] two neighbours on one side of a mixed pixel differ by less: one may be mixed
+SAME_SURFACE = 0.4  # [steps] two pixels on one surface differ by less
 GAINS = (0.6, 1.0, 1.4)  # [1] of an extrapolated amplitude all along an outline: a side face
 GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
 FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
@@ -104,7 +109,8 @@ def at_outlines(distance: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Pixels between two surfaces, in any of the four directions."""
     padded, outline_pixels = _padded(distance), torch.zeros_like(distance, dtype=torch.bool)
     for rows, columns in DIRECTIONS:
-        outline_pixels |= _between_two_surfaces(padded, (-rows, -columns), (rows, columns))
+        towards = (-rows, -columns), (rows, columns)
+        outline_pixels |= _between_two_surfaces(padded, *towards, SAME_SURFACE)
     return outline_pixels
 
 
@@ -137,12 +143,12 @@ def _resolved(
     on_first = torch.special.ndtr((shares - 0.5) / BLUR)
     for direction in DIRECTIONS:
         before, after = (-direction[0], -direction[1]), direction
-        mixed = where & _between_two_surfaces(beyond, before, after)
+        mixed = where & _between_two_surfaces(beyond, before, after, SMOOTH)
         pixels = torch.nonzero(mixed, as_tuple=True)
         first, second = _sides(beyond, light, pixels, (before, after))
         unit, of_gains = nearby[pixels], [_with_gain(first, second, gain) for gain in GAINS]
         each = [_likelihood(phasor, pixels, unit, sides, sensor) for sides in of_gains]
-        outline = Outline(after, pixels, first.distance, second.distance, distance, SMOOTH)
+        outline = Outline(after, pixels, first.distance, second.distance, distance, SAME_SURFACE)
         alone = torch.stack(each) / SHARES
         if others is not None:
             amplitudes = first.amplitude, second.amplitude
@@ -161,16 +167,19 @@ def _shares(device: torch.device) -> Float[Tensor, "s"]:
 
 
 def _between_two_surfaces(
-    distance: Float[Tensor, "h w"], before: tuple[int, int], after: tuple[int, int]
+    distance: Float[Tensor, "h w"],
+    before: tuple[int, int],
+    after: tuple[int, int],
+    smooth: float,
 ) -> Bool[Tensor, "H W"]:
-    """Pixels with a step between the neighbours on both sides, each of which has a neighbour of its
-    own at nearly the same distance.
+    """Pixels with a step between the neighbours on both sides, each of which differs by less than
+    ``smooth`` of that step from the next one on its side.
     """
     jump = (_neighbour(distance, before) - _neighbour(distance, after)).abs()
     between = jump > STEP_M
     for towards in (before, after):
         beside = _neighbour(distance, towards) - _neighbour(distance, towards, 2)
-        between &= beside.abs() < SMOOTH * jump
+        between &= beside.abs() < smooth * jump
     return between
 
 
