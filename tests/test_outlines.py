@@ -100,6 +100,32 @@ def test_mixed_pixels_have_the_distance_at_their_centre(shape, distances):
     assert (source == outlines.OUTLINE)[mixed].mean() > 0.9
 
 
+def test_a_mixed_pixel_may_have_a_mixed_neighbour():
+    """Of a stick that is two pixels wide, both edges are mixed, and none of its pixels may be pure.
+    With neighbours that agree within a quarter of the step more than half of the error stays.
+    """
+    truth, phasor = scene(lambda x, y: abs(x - 12.1 - 0.3 * y) < 1.0, 2.0, 2.6)
+    before = decoded(phasor)
+    after, _ = resolved(before, phasor)
+    assert np.mean((after - truth) ** 2) < 0.35 * np.mean((before - truth) ** 2)
+
+
+@pytest.mark.parametrize("slope", [0.08, 0.15, 0.3])
+def test_on_a_slope_a_distance_is_within_what_both_sides_continue_to(slope):
+    """Errors of a rendering whose phasor is right fall to a third, and no distance leaves the
+    surroundings that it had.
+    """
+    columns = np.arange(WIDTH)[None].repeat(HEIGHT, axis=0)
+    truth = 2.0 + slope * columns  # [m]
+    phasor = 0.5 / truth**2 * np.exp(1j * (SENSOR.phase_slope * truth + SENSOR.phase_offset))
+    before = truth + np.random.default_rng(0).normal(0.0, 0.02, truth.shape)
+    after, _ = resolved(before, phasor)
+    assert np.mean((after - truth) ** 2) < 0.33 * np.mean((before - truth) ** 2)
+    low, high = extremes(torch.tensor(before, dtype=torch.float32))
+    assert (after >= low.numpy() - 1e-5).all()
+    assert (after <= high.numpy() + 1e-5).all()
+
+
 def test_the_closed_form_of_a_moving_camera_is_resolved_too():
     """Its distance is first what the phasor of the run decodes to, here without the noise of the
     measurement; of a camera at rest the closed form stays.
@@ -222,8 +248,9 @@ def test_a_run_of_a_moving_camera_resolves_its_closed_form(tmp_path, monkeypatch
     resolved_here, stays = given.source == outlines.OUTLINE, given.source == CLOSED_FORM
     assert 0.02 < resolved_here.float().mean() < 0.8
     assert (resolved_here | stays).all()
-    assert (given.distance - closed).abs()[resolved_here].mean() > 0.05
-    assert (given.distance - closed).abs()[stays].median() < 0.03
+    change = (given.distance - closed).abs()
+    assert change[resolved_here].quantile(0.9) > 0.05  # the others are on slopes
+    assert change[stays].median() < 0.03
     monkeypatch.setattr(fallback, "UNEXPLAINED_SOUND", 1.0)
     averaged = Run.open(run.path).render(*view)
     assert torch.equal(averaged.source, given.source)
