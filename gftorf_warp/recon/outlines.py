@@ -18,8 +18,8 @@ phasor is as likely: its distance is the rendered one. The phasor is not only re
 phasors.py, and of a moving outline other raw frames tell more, see other_frames.py.
 
 A neighbour may be mixed itself, so only its own neighbour has to be nearer to it than the other
-side is. Steep slopes fulfil this, too: there the distance of a pixel is brought within what both
-sides continue to.
+side is. Steep slopes fulfil this, too: there the distance of a pixel is a mean of what both sides
+continue to, weighted by the same likelihoods.
 """
 
 from __future__ import annotations
