@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from gftorf_warp.data.temporal import agreement, averaged_locally
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
+from gftorf_warp.recon import fallback
 from gftorf_warp.recon.fallback import Fallback
 from gftorf_warp.recon.residuals import residuals
 from gftorf_warp.recon.run import Run
@@ -136,6 +138,51 @@ def test_where_the_fit_fails_the_quartet_itself_is_taken(box):
     black = fallback_of(measured, np.zeros_like(quads))
     assert not (applied(black, np.full((36, 48), 9.0), 13)[1] == FIT).any()
     assert SOURCES[CLOSED_FORM] == "closed_form"
+
+
+def test_another_surface_beside_what_moves_stays_if_the_fit_explains_the_quads(box, monkeypatch):
+    """Up to five pixels from what changes, not elsewhere; its phasor is not the mean then."""
+    measured, quads, truth = box
+    monkeypatch.setattr(fallback, "BESIDE", 0.1)
+    changes = (~agreement(measured)[3]).astype(np.uint8)
+    beside = (cv2.dilate(changes, np.ones((11, 11), np.uint8)) > 0) & (changes == 0)
+    beside &= cv2.dilate(changes, np.ones((5, 5), np.uint8)) == 0
+    nearer = np.where(beside | (np.arange(36)[:, None] < 2), truth[13] - 0.5, truth[13])
+    good, time = fallback_of(measured, quads), 13 / FRAME_RATE_HZ
+    distance, source, _ = applied(good, nearer, 13)
+    assert beside.sum() > 100
+    assert (source[beside] == FIT).mean() > 0.75, "all but those of more noise"
+    assert (source[:2][~beside[:2]] == TEMPORAL).all()
+    assert (distance[:2][~beside[:2]] > truth[13][:2][~beside[:2]] - 0.05).all()
+    rests = good.rests_at(rendering(nearer), time, good.camera).numpy()
+    assert not rests[beside & (source == FIT)].any()
+    assert good.rests_at(rendering(truth[13]), time, good.camera).numpy()[beside].mean() > 0.95
+    dark = fallback_of(measured, 0.8 * quads)
+    assert (applied(dark, nearer, 13)[1][beside] == TEMPORAL).mean() > 0.95
+    assert good.rests_at(rendering(nearer), 99.0, good.camera) is None
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-4])
+def test_where_one_phasor_is_exact_a_fit_that_nearly_explains_the_quads_is_replaced(noise):
+    """A wall that is darker during the last quartet. Seven per cent of the amplitude are within
+    what a fit may miss, but not within a noise that is far smaller than that.
+    """
+    factors = np.repeat([1.0] * 7 + [0.4], 4)[:, None, None]
+    clean = np.tile(recording(frames=4, noise=0.0)[0].quads, (8, 1, 1)) * factors
+    quads = clean + noise * np.random.default_rng(1).standard_normal(clean.shape)
+    measured, truth = recording(frames=FRAMES)
+    fitted = np.where(factors < 1.0, 0.93, 1.0) * clean
+    found = fallback_of(replace(measured, quads=quads.astype(np.float32)), fitted)
+    one_time = closed_form_distance(found.sequence, 7)
+    still = np.abs(one_time - truth.distance[0]) < 0.02
+    assert still.mean() > 0.5
+    assert found.explained[7].float().mean() > 0.95
+    distance, source, _ = applied(found, one_time + 0.06, 29)
+    assert ((source == CLOSED_FORM)[still].mean() > 0.95) == (noise == 0.0)
+    assert ((source == FIT)[still].mean() > 0.95) == (noise > 0.0)
+    if noise == 0.0:
+        taken = source == CLOSED_FORM
+        np.testing.assert_allclose(distance[taken], one_time[taken], atol=1e-5)
 
 
 def test_other_times_and_views_keep_the_fit(box):

@@ -265,9 +265,8 @@ def test_a_rendering_at_a_raw_frame_uses_it(run):
     fitted = run.renderer(("distance", "phasor"), corrected=False)(time, camera)
     rendering = run.fallback.applied(fitted, time, camera)
     measured = MeasuredPhasors.of(sequence, camera, run.field.device)
-    phasor = replace(measured, averaged=run.fallback.rests).corrected(
-        rendering, time, camera, f_mod_hz
-    )
+    rests = run.fallback.rests_at(fitted, time, camera)
+    phasor = measured.corrected(rendering, time, camera, f_mod_hz, averaged=rests)
     others = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
     given = run.corrected(fitted, time, camera).distance
     parts, without = (

@@ -15,6 +15,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from gftorf_warp.data.sequence import Flow
 from gftorf_warp.errors import InputError
 from gftorf_warp.scene import measured
+from gftorf_warp.scene.along_flow import Slots
 from gftorf_warp.scene.background import background
 from gftorf_warp.scene.initialise import STATIC, Init, InitSettings, from_quartets
 from gftorf_warp.scene.motion import MotionSettings, MotionStart
@@ -128,6 +129,49 @@ def test_where_nothing_moves_there_are_no_points(kind):
     found = points_of(recorded(kind, speed=0.0))
     assert len(found) == FRAMES // len(KINDS[kind][0])
     assert sum(len(p.mean) for p in found) <= 2
+
+
+def test_a_surface_with_one_component_of_the_background_is_found():
+    """A stick half the unambiguous range in front of a wall: the quads of two opposite shifts do
+    not show it, and those of the others do.
+    """
+    wall, stick, column = 0.75 * 7.5, 0.25 * 7.5, np.arange(WIDTH) + 0.5
+    places = [8.0 + 0.8 * n for n in range(FRAMES)]
+    there = [np.abs(column - place) < 2.0 for place in places]
+    slope = 4.0 * np.pi * F / SPEED_OF_LIGHT
+    quads = np.stack(
+        [
+            np.where(here, 0.06, 0.01) * np.cos(slope * np.where(here, stick, wall) - shift)
+            for here, shift in zip(there, np.tile(CANONICAL_SHIFTS, FRAMES // 4), strict=True)
+        ]
+    )
+    quads = np.repeat(quads[:, None], HEIGHT, axis=1)
+    quads += NOISE * np.random.default_rng(0).standard_normal(quads.shape)
+    sequence = recording(frames=FRAMES, quads=quads.astype(np.float32), with_flow=False)[0]
+    found = points_of(sequence)
+    assert len(found) == FRAMES // 4
+    for points in found[1:-1]:
+        column_of, _ = pixels(sequence, points.mean)
+        assert len(points.mean) > 2 * HEIGHT
+        apart = np.abs(column_of + 0.5 - places[4 * points.quartet] - 1.6)
+        assert (apart < 3.0).mean() > 0.8, "half of the stick, and the 5 pixels of a box"
+        assert np.median(np.abs(points.distance.numpy() - stick)) < 0.02
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_slots_that_may_be_those_of_the_background(kind):
+    """One, and its opposite if there is no constant part, which the amplitude changes."""
+    slots = Slots.of(recorded(kind), 0)
+    same = (~slots.differing).sum(axis=1)
+    pairs = kind in ("four shifts", "phasors", "one instant")
+    np.testing.assert_array_equal(same, np.full(len(same), 2 if pairs else 1))
+    every = torch.ones(1, len(same), 1, 1, dtype=torch.bool)
+    assert bool(slots.moves(every))
+    for k in range(len(same)):
+        one = every.clone()
+        one[:, k] = False
+        assert bool(slots.moves(one))
+        assert not bool(slots.moves(~one))
 
 
 def test_a_recording_without_noise_has_its_points_on_the_box():

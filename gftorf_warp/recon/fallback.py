@@ -5,12 +5,15 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
 * the *temporal mean* of all quartets that agree with their pixel's median, or else of a quartet and
   the neighbours in time that measured the same, if the fit is more than a few standard deviations
   of that mean away. Beside a pixel that does not agree, an edge may be passing: there the fit stays
-  if it explains the quads as well as the mean does;
-* the *closed form* of the quartet where no other one measured the same, the fit does not explain
-  its raw frames (see residuals.py), and one phasor explains them better: nothing moved within it.
-  What moved can look like one phasor by chance, at a distance that no neighbour has: there it has
-  to explain them still better. A fit that explains no more than black images do is replaced
-  wherever it fails.
+  if it explains the quads as well as the mean does. Where it shows another surface, that may be
+  there in one raw frame only, with the quad of what is behind: near a pixel that does not agree,
+  it stays if it explains the quads nearly as well;
+* the *closed form* of the quartet where no other one measured the same, and one phasor explains its
+  raw frames better than the fit does: nothing moved within it. Either the fit does not explain them
+  (see residuals.py), or one phasor does so to within the noise, where the fit may be wrong by a few
+  per cent of the amplitude. What moved can look like one phasor by chance, at a distance that no
+  neighbour has: there it has to explain them still better. A fit that explains no more than black
+  images do is replaced wherever it fails.
 
 A moving camera has no temporal mean, and its fits are worse: there the closed form replaces the
 distance of a pixel wherever one phasor explains its quads, or explains them as well as the fit
@@ -55,6 +58,8 @@ from .residuals import CHI_SQUARE_MAX, Residuals
 
 ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
+AS_GOOD = 2.0  # [1] of the chi-square of a mean: a fit that may be right beside what moves
+BESIDE = 0.02  # [width] how far from a pixel that changes a surface may pass without a trace
 UNEXPLAINED_SOUND = 0.12  # [1] of the pixels, of a fit that is averaged with the closed form
 
 
@@ -72,6 +77,8 @@ class Fallback:
     """How far from it the fit may be [m]: a few of its standard deviations."""
     rests: Bool[Tensor, "Q H W"]
     """Where it may replace the fit."""
+    passes: Bool[Tensor, "Q H W"]
+    """But not if the fit shows another surface, which may pass there without a trace."""
     closed_form: Float[Tensor, "Q H W"]
     """Distance of the quartet [m], in [0, range)."""
     moved: Bool[Tensor, "Q H W"]
@@ -114,11 +121,15 @@ class Fallback:
         odds = _odds(residuals.changing_unexplained_share, residuals)
         margin = 2.0 * math.log(odds) / sequence.cycle
         fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
+        passes = _beside(~agrees & (count == 1)) & (
+            chi_square <= AS_GOOD * np.maximum(of_mean, 1.0)
+        )
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
         if temporal.camera_rests(sequence):
             needed = np.where(_supported(alone), odds, odds**2)
             needed = np.where(_is_useless(residuals, sequence, noise), 0.0, needed)
-            moved = ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
+            moved = chi_square > needed * np.maximum(of_phasor, 1.0)
+            moved &= ~explained | (of_phasor <= CHI_SQUARE_MAX)
             moved &= ~agrees & (count == 1)
         else:  # a chi-square that is not finite is none
             moved = (of_phasor <= CHI_SQUARE_MAX) | ~(chi_square < of_phasor)
@@ -134,6 +145,7 @@ class Fallback:
             temporal=tensor(mean),
             stays=tensor(stays * temporal.sigma_of_mean(sequence, noise, count)),
             rests=tensor((count > 1) & ~fit_stays),
+            passes=tensor(passes),
             closed_form=tensor(alone),
             moved=tensor(moved),
             mixed=tensor(near_steps(mean) | np.stack([_at_outlines(image) for image in mean])),
@@ -162,8 +174,8 @@ class Fallback:
         if row is None:
             return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)
-        apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
-        averaged = self.rests[row] & ~(apart.abs() <= self.stays[row])
+        apart = self._apart(fit, row)
+        averaged = self._rests(apart, row) & ~(apart.abs() <= self.stays[row])
         between = _between(fit, mean, STEP_M + 2.0 * self.stays[row])
         averaged &= ~(between & self.mixed[row] & self.explained[row])
         value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
@@ -174,6 +186,25 @@ class Fallback:
         if opacity.numel():
             opacity = torch.where(source > 0, torch.ones_like(opacity), opacity)
         return replace(rendering, distance=distance, opacity=opacity, source=source)
+
+    def rests_at(
+        self, rendering: Rendering, time: float, camera: Camera
+    ) -> Bool[Tensor, "H W"] | None:
+        """Where the temporal mean may replace the distance of a rendering of the fit; None if
+        nothing may, as in :meth:`applied`.
+        """
+        row = closed_form.row_of(self.sequence, time, camera, self.camera)
+        if row is None:
+            return None
+        return self._rests(self._apart(rendering.distance, row), row)
+
+    def _rests(self, apart: Float[Tensor, "H W"], row: int) -> Bool[Tensor, "H W"]:
+        return self.rests[row] & ~(self.passes[row] & (apart.abs() > STEP_M))
+
+    def _apart(self, fit: Float[Tensor, "H W"], row: int) -> Float[Tensor, "H W"]:
+        """Distance from the temporal mean to the fit [m], whole turns aside."""
+        reach = unambiguous_range(self.sequence)
+        return torch.remainder(fit - self.temporal[row] + 0.5 * reach, reach) - 0.5 * reach
 
 
 def _odds(wrong: float | None, residuals: Residuals) -> float:
@@ -206,6 +237,16 @@ def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:
     rows = np.arange(sequence.height) * images.shape[1] // sequence.height
     columns = np.arange(sequence.width) * images.shape[2] // sequence.width
     return images[:, rows[:, None], columns]
+
+
+def _beside(mask: Bool[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
+    """What is near the mask in the image; a pixel of it alone, or two, are noise."""
+    import cv2
+
+    side = 2 * max(round(BESIDE * mask.shape[2]), 1) + 1
+    kernel = np.ones((side, side), np.uint8)
+    counts = (cv2.boxFilter(m.astype(np.uint8), -1, (3, 3), normalize=False) for m in mask)
+    return np.stack([cv2.dilate(np.uint8(count > 2), kernel) > 0 for count in counts])
 
 
 def _supported(distance: Float[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:

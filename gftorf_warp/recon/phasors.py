@@ -105,7 +105,7 @@ class MeasuredPhasors:
     variance: Float[Tensor, "Q H W"]
     """Of each of its components, from the noise [quad units^2]."""
     averaged: Bool[Tensor, "Q H W"]
-    """Where it is a mean of several quartets that may replace what is rendered."""
+    """Where it is a mean of several quartets."""
     of_quads: Float[Tensor, "K H W"]
     """Variance of the quad of every slot, from the noise [quad units^2]."""
 
@@ -142,7 +142,13 @@ class MeasuredPhasors:
         )
 
     def corrected(
-        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float
+        self,
+        rendering: Rendering,
+        time: float,
+        camera: Camera,
+        f_mod_hz: float,
+        *,
+        averaged: Bool[Tensor, "H W"] | None = None,
     ) -> Phasor:
         """The phasor of a rendering, corrected where more is known.
 
@@ -151,6 +157,8 @@ class MeasuredPhasors:
             time: Of the rendering [s].
             camera: Of the rendering.
             f_mod_hz: Modulation frequency [Hz].
+            averaged: Where the mean of several quartets may replace what is rendered; None:
+                wherever there is one.
         """
         rendered, sequence = rendered_phasor(rendering), self.sequence
         row = closed_form.row_of(sequence, time, camera, self.camera)
@@ -162,7 +170,7 @@ class MeasuredPhasors:
         if at_frame and not one_tap and sequence.measured[n]:
             if sequence.frame_frequencies[n] == f_mod_hz:
                 phasor = self._with_quad(rendered, n)
-        there = self.averaged[row]
+        there = self.averaged[row] if averaged is None else averaged
         if rendering.source is not None:
             there = there | (rendering.source == CLOSED_FORM)
         residual = self.value[row, sequence.frequencies.index(f_mod_hz)] - rendered.value

@@ -30,6 +30,7 @@ TO_BACKGROUND, TRANSLATED = 4.0, 0.3
 GAIN = 0.8  # a later candidate must have less than this share of the score
 REACH = 0.08  # [width] largest translation during a quartet
 STEPS = 6  # translations from the middle to the reach
+OPPOSITE = -0.999  # cosine of the difference of two phase shifts that are half a turn apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,8 +44,8 @@ class AlongFlow:
     residual: Float[Tensor, "h w"]
     """Mean squared residual over what is allowed [1]."""
     moves: Bool[Tensor, "h w"]
-    """Whether all raw frames but one differ from the background: a surface may resemble it in one
-    slot."""
+    """Whether the raw frames differ from the background as those of another surface do, see
+    :attr:`Slots.differing`."""
 
 
 @torch.no_grad()
@@ -70,8 +71,7 @@ def along_best(
         phasors, squares = slots.phasors(along[0])
         allowed = noise**2 + RELATIVE**2 * 0.25 * phasors[:, :2].square().sum(dim=1)
         residual = _pooled(squares / allowed, POOL)
-        differing = (along[1] > DIFFERS).sum(dim=1, dtype=torch.uint8)
-        moves = (differing >= len(slots.share) - 1).to(residual)
+        moves = slots.moves(along[1] > DIFFERS).to(residual)
         score = residual + TO_BACKGROUND * (1.0 - moves) + penalty
         known = flow.expand(-1, -1, *residual.shape[1:]), phasors
         best.update(score, (*known, residual[:, None], moves[:, None]))
@@ -117,6 +117,9 @@ class Slots:
     """Phasor of each frequency (re, im) by least squares from the quads."""
     rest: Float[np.ndarray, "free K"]
     """Orthonormal combinations of the quads that are zero for any phasors."""
+    differing: Bool[np.ndarray, "g K"]
+    """Alternatives of slots that differ from the background where another surface is: all but one,
+    since its quad may be the same by chance; without a DC offset the opposite one is then, too."""
 
     @property
     def decide(self) -> bool:
@@ -146,7 +149,19 @@ class Slots:
                 rows[-1][:, mask] = values
         at_once = sequence.from_phasors or duration == 0.0
         share = np.zeros(len(times)) if at_once else (times - times.mean()) / duration
-        return cls(share=share, fit=np.concatenate(fit), rest=np.concatenate(rest))
+        same = np.eye(len(times), dtype=bool)
+        if not constant:
+            frequencies = sequence.frame_frequencies[frames]
+            apart = np.cos(shifts[:, None] - shifts)
+            same |= (apart < OPPOSITE) & (frequencies[:, None] == frequencies)
+        return cls(share=share, fit=np.concatenate(fit), rest=np.concatenate(rest), differing=~same)
+
+    def moves(self, differs: Bool[Tensor, "B K h w"]) -> Bool[Tensor, "B h w"]:
+        """Whether all slots of an alternative of :attr:`differing` do."""
+        moves = torch.zeros_like(differs[:, 0])
+        for slots in np.unique(self.differing, axis=0):
+            moves |= differs[:, np.flatnonzero(slots).tolist()].all(dim=1)
+        return moves
 
     def phasors(
         self, quads: Float[Tensor, "B K h w"]

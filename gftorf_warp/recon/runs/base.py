@@ -144,14 +144,16 @@ class Run(StoredRun):
         """
         if not self._corrects:
             return rendering
-        fitted = None
+        fitted = rests = None
         if self.fallback is not None:
             fitted = rendering.distance if self.fallback.averages else None
+            rests = self.fallback.rests_at(rendering, time, camera)
             rendering = self.fallback.applied(rendering, time, camera)
         sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
         phasor = None
         if measured is not None:
-            phasor = measured.corrected(rendering, time, camera, float(sensor.f_mod_hz))
+            frequency = float(sensor.f_mod_hz)
+            phasor = measured.corrected(rendering, time, camera, frequency, averaged=rests)
         if self.config["settings"].get("outlines") and not light_only:
             moves = self.fallback is not None and self.fallback.camera_moves
             others = None
@@ -222,11 +224,7 @@ class Run(StoredRun):
         is logged.
         """
         try:
-            measured = MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
-            if measured is None or self.fallback is None:
-                return measured
-            # beside what moves, a fit that explains the quads as well as the mean is right
-            return replace(measured, averaged=self.fallback.rests)
+            return MeasuredPhasors.of(self.sequence(), self.camera, self.field.device)
         except InputError as error:
             LOG.warning("outlines from renderings alone: %s: %s", error.what, error.why)
             return None
