@@ -28,7 +28,9 @@ from ..scene.network import Network
 from .states import Fitted, pairs_of
 from .timing import Report, Timing, lines_of, quietly, watch_of
 
-WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
+# Images before anything is timed: kernels are loaded, moments exist. Within the first epoch a step
+# takes 1 to 2 ms longer on the host, where a batch is drawn for the first time.
+WARM_UP = 24
 WATCHED = 16  # images of a profile
 ON_DEVICE = {"kernel", "gpu_memset", "gpu_memcpy"}  # kinds of events of torch's profiler
 PART = 40  # images of one timing
