@@ -138,16 +138,18 @@ def test_a_surface_with_one_component_of_the_background_is_found():
     wall, stick, column = 0.75 * 7.5, 0.25 * 7.5, np.arange(WIDTH) + 0.5
     places = [8.0 + 0.8 * n for n in range(FRAMES)]
     there = [np.abs(column - place) < 2.0 for place in places]
+    shifts = np.tile(np.array(CANONICAL_SHIFTS)[[0, 2, 1, 3]], FRAMES // 4)
     slope = 4.0 * np.pi * F / SPEED_OF_LIGHT
     quads = np.stack(
         [
             np.where(here, 0.06, 0.01) * np.cos(slope * np.where(here, stick, wall) - shift)
-            for here, shift in zip(there, np.tile(CANONICAL_SHIFTS, FRAMES // 4), strict=True)
+            for here, shift in zip(there, shifts, strict=True)
         ]
     )
     quads = np.repeat(quads[:, None], HEIGHT, axis=1)
     quads += NOISE * np.random.default_rng(0).standard_normal(quads.shape)
-    sequence = recording(frames=FRAMES, quads=quads.astype(np.float32), with_flow=False)[0]
+    changes = {"quads": quads.astype(np.float32), "with_flow": False}
+    sequence = recording(frames=FRAMES, order=(0, 2, 1, 3), **changes)[0]
     found = points_of(sequence)
     assert len(found) == FRAMES // 4
     for points in found[1:-1]:
@@ -160,18 +162,32 @@ def test_a_surface_with_one_component_of_the_background_is_found():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_slots_that_may_be_those_of_the_background(kind):
-    """One, and its opposite if there is no constant part, which the amplitude changes."""
+    """One at least. Opposite shifts follow each other here, so that a surface that leaves or
+    arrives would differ in the other two.
+    """
     slots = Slots.of(recorded(kind), 0)
-    same = (~slots.differing).sum(axis=1)
-    pairs = kind in ("four shifts", "phasors", "one instant")
-    np.testing.assert_array_equal(same, np.full(len(same), 2 if pairs else 1))
-    every = torch.ones(1, len(same), 1, 1, dtype=torch.bool)
+    np.testing.assert_array_equal(slots.differing, ~np.eye(recorded(kind).cycle, dtype=bool))
+    every = torch.ones(1, len(slots.differing), 1, 1, dtype=torch.bool)
     assert bool(slots.moves(every))
-    for k in range(len(same)):
+    for k in range(len(slots.differing)):
         one = every.clone()
         one[:, k] = False
         assert bool(slots.moves(one))
         assert not bool(slots.moves(~one))
+
+
+def test_opposite_slots_in_turns_may_both_be_those_of_the_background():
+    """The second and the fourth, or the first and the third; not with a constant part."""
+    turns = {"order": (0, 2, 1, 3), "frames": 8}
+    slots = Slots.of(recording(**turns)[0], 0)
+    alike = np.array([[1, 0, 1, 0], [0, 1, 0, 1]] * 2, dtype=bool)
+    np.testing.assert_array_equal(slots.differing, ~alike)
+    for shown, moves in (((0, 2), True), ((1, 3), True), ((0, 1), False), ((2, 3), False)):
+        differs = torch.zeros(1, 4, 1, 1, dtype=torch.bool)
+        differs[:, list(shown)] = True
+        assert bool(slots.moves(differs)) == moves
+    constant = Slots.of(recording(**turns, dc_offset=0.3)[0], 0)
+    np.testing.assert_array_equal(constant.differing, ~np.eye(4, dtype=bool))
 
 
 def test_a_recording_without_noise_has_its_points_on_the_box():

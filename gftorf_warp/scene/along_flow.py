@@ -119,7 +119,8 @@ class Slots:
     """Orthonormal combinations of the quads that are zero for any phasors."""
     differing: Bool[np.ndarray, "g K"]
     """Alternatives of slots that differ from the background where another surface is: all but one,
-    since its quad may be the same by chance; without a DC offset the opposite one is then, too."""
+    since its quad may be the same by chance; without a DC offset the opposite one is then, too. But
+    slots that are all earlier or all later differ where a surface leaves or arrives."""
 
     @property
     def decide(self) -> bool:
@@ -154,6 +155,10 @@ class Slots:
             frequencies = sequence.frame_frequencies[frames]
             apart = np.cos(shifts[:, None] - shifts)
             same |= (apart < OPPOSITE) & (frequencies[:, None] == frequencies)
+        for k, (alike, others) in enumerate(zip(same, ~same, strict=True)):
+            slots, differ = np.flatnonzero(alike), np.flatnonzero(others)
+            if differ.max() < slots.min() or differ.min() > slots.max():
+                same[k] = np.arange(len(times)) == k
         return cls(share=share, fit=np.concatenate(fit), rest=np.concatenate(rest), differing=~same)
 
     def moves(self, differs: Bool[Tensor, "B K h w"]) -> Bool[Tensor, "B h w"]:
