@@ -246,7 +246,7 @@ def _beside(mask: Bool[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
     side = 2 * max(round(BESIDE * mask.shape[2]), 1) + 1
     kernel = np.ones((side, side), np.uint8)
     counts = (cv2.boxFilter(m.astype(np.uint8), -1, (3, 3), normalize=False) for m in mask)
-    return np.stack([cv2.dilate(np.uint8(count > 2), kernel) > 0 for count in counts])
+    return np.stack([cv2.dilate((count > 2).astype(np.uint8), kernel) > 0 for count in counts])
 
 
 def _supported(distance: Float[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:

@@ -160,7 +160,7 @@ def _decoded(
     least = max(ROUNDING * float(background.amplitude.max()), 1e-12)
     noise, shape = max(change.noise, least), quads.shape[1:]
     differs = _pooled(np.square((quads - background_quads) / noise), POOL_DIFFERENCE)
-    changed = (differs > DIFFERS).any(axis=0).astype(np.uint8)
+    changed = np.asarray((differs > DIFFERS).any(axis=0), dtype=np.uint8)
     box = _box(cv2.medianBlur(changed, 3), margin=round(REACH * sequence.width) + POOL)
     whole = _Decoded(
         flow=np.zeros((2, *shape), np.float32),

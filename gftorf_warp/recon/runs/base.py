@@ -150,15 +150,13 @@ class Run(StoredRun):
             rests = self.fallback.rests_at(rendering, time, camera)
             rendering = self.fallback.applied(rendering, time, camera)
         sensor, measured = at_frequency(self.sensor, f_mod_hz), self._measured_phasors
-        phasor = None
+        frequency, phasor = float(sensor.f_mod_hz), None
         if measured is not None:
-            frequency = float(sensor.f_mod_hz)
             phasor = measured.corrected(rendering, time, camera, frequency, averaged=rests)
         if self.config["settings"].get("outlines") and not light_only:
             moves = self.fallback is not None and self.fallback.camera_moves
             others = None
             if self._moving_outlines is not None:
-                frequency = float(sensor.f_mod_hz)
                 others = self._moving_outlines.at(rendering, time, camera, frequency)
             rendering = outlines.resolved(
                 rendering, sensor, phasor, camera_moves=moves, fitted=fitted, others=others
