@@ -177,7 +177,9 @@ def test_slots_that_may_be_those_of_the_background(kind):
 
 
 def test_opposite_slots_in_turns_may_both_be_those_of_the_background():
-    """The second and the fourth, or the first and the third; not with a constant part."""
+    """The second and the fourth, or the first and the third; not with a constant part, and not the
+    first and the last, which leave two consecutive ones.
+    """
     turns = {"order": (0, 2, 1, 3), "frames": 8}
     slots = Slots.of(recording(**turns)[0], 0)
     alike = np.array([[1, 0, 1, 0], [0, 1, 0, 1]] * 2, dtype=bool)
@@ -186,6 +188,9 @@ def test_opposite_slots_in_turns_may_both_be_those_of_the_background():
         differs = torch.zeros(1, 4, 1, 1, dtype=torch.bool)
         differs[:, list(shown)] = True
         assert bool(slots.moves(differs)) == moves
+    nested = Slots.of(recording(order=(0, 2, 3, 1), frames=8)[0], 0).differing
+    np.testing.assert_array_equal(nested[1:3], [[1, 0, 0, 1]] * 2)
+    np.testing.assert_array_equal(nested[::3], [[0, 1, 1, 1], [1, 1, 1, 0]])
     constant = Slots.of(recording(**turns, dc_offset=0.3)[0], 0)
     np.testing.assert_array_equal(constant.differing, ~np.eye(4, dtype=bool))
 

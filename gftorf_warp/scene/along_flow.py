@@ -120,7 +120,7 @@ class Slots:
     differing: Bool[np.ndarray, "g K"]
     """Alternatives of slots that differ from the background where another surface is: all but one,
     since its quad may be the same by chance; without a DC offset the opposite one is then, too. But
-    slots that are all earlier or all later differ where a surface leaves or arrives."""
+    consecutive slots alone differ where a surface leaves, arrives or passes quickly."""
 
     @property
     def decide(self) -> bool:
@@ -155,9 +155,8 @@ class Slots:
             frequencies = sequence.frame_frequencies[frames]
             apart = np.cos(shifts[:, None] - shifts)
             same |= (apart < OPPOSITE) & (frequencies[:, None] == frequencies)
-        for k, (alike, others) in enumerate(zip(same, ~same, strict=True)):
-            slots, differ = np.flatnonzero(alike), np.flatnonzero(others)
-            if differ.max() < slots.min() or differ.min() > slots.max():
+        for k, others in enumerate(~same):
+            if (np.diff(np.flatnonzero(others)) == 1).all():
                 same[k] = np.arange(len(times)) == k
         return cls(share=share, fit=np.concatenate(fit), rest=np.concatenate(rest), differing=~same)
 
