@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
 from gftorf_warp.data.write import write
 from gftorf_warp.recon import outlines, presets
 from gftorf_warp.recon.other_frames import OtherFrames, log_likelihood, normals_of
-from gftorf_warp.recon.phasors import MeasuredPhasors, Phasor
+from gftorf_warp.recon.phasors import MeasuredPhasors, Phasor, rendered_phasor
 from gftorf_warp.recon.runs.moving import MovingOutlines
 from gftorf_warp.recon.straight import Outline
 from gftorf_warp.recon.train import reconstruct
@@ -266,17 +267,132 @@ def test_a_rendering_at_a_raw_frame_uses_it(run):
     rendering = run.fallback.applied(fitted, time, camera)
     measured = MeasuredPhasors.of(sequence, camera, run.field.device)
     rests = run.fallback.rests_at(fitted, time, camera)
-    phasor = measured.corrected(rendering, time, camera, f_mod_hz, averaged=rests)
     others = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
-    given = run.corrected(fitted, time, camera).distance
+    assert others.across is not None
+    given = run.corrected(fitted, time, camera)
     parts, without = (
-        outlines.resolved(rendering, sensor, phasor, others=which).distance
+        outlines.resolved(
+            rendering,
+            sensor,
+            measured.corrected(
+                rendering, time, camera, f_mod_hz, averaged=rests, across=which and which.across
+            ),
+            others=which,
+        ).distance
         for which in (others, None)
     )
+    smooth = measured.corrected(rendering, time, camera, f_mod_hz, averaged=rests)
+    torch.testing.assert_close(torch.complex(*given.phasor[:2]), smooth.value)
+    given = given.distance
     torch.testing.assert_close(given, parts)
     differs = (given - without).abs() > 0.01
     assert 0.002 < differs.float().mean() < 0.05
     assert others.moving[differs].min() > 0.01
+
+
+THIRDS = tuple(2.0 * np.pi * k / 3.0 for k in range(3))
+WRONG = 1.2 * np.exp(0.15j)  # a measured phasor over the one that the Gaussians explain
+
+
+def misfit(run, shifts, factor=WRONG):
+    """The recording of a run as if its phasors, or those of each raw frame, were wrong by a factor,
+    and what is missing in them.
+    """
+    sequence, phasors = run.sequence(), rendered(run)
+    shifts = np.resize(shifts, sequence.frames)
+    quads = 0.5 * np.real(factor * phasors * np.exp(-1j * shifts)[:, None, None])
+    wrong = changed(sequence, quads=quads.astype(np.float32), shifts=shifts)
+    return wrong, (factor - 1.0) * phasors
+
+
+def rendered(run):
+    """Phasors of all raw frames."""
+    images = run.renderer(("phasor",), corrected=False)
+    times = run.sequence().times.tolist()
+    phasors = [images(time, run.camera).phasor.numpy().copy() for time in times]
+    return np.stack([re + 1j * im for re, im, _ in phasors])
+
+
+@pytest.mark.parametrize("shifts", [CANONICAL_SHIFTS, THIRDS])
+@pytest.mark.parametrize("n", [0, 5, 6, 9, 14])
+def test_other_raw_frames_tell_the_other_component(run, shifts, n):
+    """Where all phasors are wrong by one factor, on the wall and on the box that moves by up to
+    two pixels from one raw frame to the next; inside both, since outlines of two windows differ.
+    """
+    sequence, wrong = misfit(run, shifts)
+    others = others_of(run, n, sequence=sequence)
+    truth = (wrong[n] * np.exp(-1j * sequence.shifts[n])).imag
+    moving = others.moving.numpy()
+    box = cv2.erode((moving > 0.9).astype(np.uint8), np.ones((3, 3))) > 0
+    wall = cv2.erode((moving < 0.02).astype(np.uint8), np.ones((9, 9))) > 0
+    for inside, limit in ((box, 0.2), (wall, 0.1)):
+        assert inside.sum() > 50
+        apart = np.abs(others.across.numpy() - truth)[inside]
+        assert np.median(apart) < limit * np.abs(wrong[n])[inside].mean()
+
+
+def test_the_other_component_is_moved_with_its_surface(run, monkeypatch):
+    """Stripes on the box, of a period of five pixels, are found where they are."""
+    n = 6
+    velocity = flow(n, 1)[0][seen(n)[2]].mean()
+    x = np.arange(seen(n)[2].shape[1])
+    moved = velocity * (np.arange(run.sequence().frames) - n)
+    stripes = 1.0 + 0.3 * np.sin(2.0 * np.pi * (x - moved[:, None, None]) / 5.0)
+    sequence, wrong = misfit(run, CANONICAL_SHIFTS, stripes)
+    truth = (wrong[n] * np.exp(-1j * sequence.shifts[n])).imag
+    errors = []
+    for moves in (True, False):
+        if not moves:
+            monkeypatch.setattr("gftorf_warp.recon.runs.moving.moved_back", lambda image, _: image)
+        others = others_of(run, n, sequence=sequence)
+        box = others.moving.numpy() > 0.9
+        errors.append(np.square(others.across.numpy() - truth)[box].mean())
+    assert errors[1] > 0.1 * np.square(truth[box]).mean()
+    assert errors[0] < 0.3 * errors[1]
+
+
+def test_a_phasor_is_mended_in_both_components(run):
+    """The quad of the raw frame mends one, the other raw frames the other one: whole, where less
+    would be taken of it without them; and with the noise of the quad along it.
+    """
+    sequence, wrong = misfit(run, CANONICAL_SHIFTS)
+    n, camera, f_mod_hz = 6, run.camera, float(run.sensor.f_mod_hz)
+    time = float(sequence.times[n])
+    measured = MeasuredPhasors.of(sequence, camera, run.field.device)
+    rendering = run.renderer(("distance", "phasor"), corrected=False)(time, camera)
+    turn = np.exp(-1j * sequence.shifts[n])
+    across = torch.as_tensor((wrong[n] * turn).imag, dtype=torch.float32)
+    nowhere = torch.zeros_like(across, dtype=torch.bool)
+    given = measured.corrected(rendering, time, camera, f_mod_hz, averaged=nowhere, across=across)
+    right = torch.complex(*rendering.phasor[:2]) + torch.as_tensor(wrong[n])
+    torch.testing.assert_close(given.value, right.to(given.value), atol=1e-5, rtol=1e-4)
+    cosine, sine = turn.real, -turn.imag
+    along = (
+        given.variance_re * cosine**2
+        + given.variance_im * sine**2
+        + 2.0 * given.covariance * cosine * sine
+    )
+    noise = along - rendered_phasor(rendering).variance_re
+    torch.testing.assert_close(noise, 4.0 * measured.of_quads[n % 4], atol=1e-9, rtol=1e-2)
+
+
+def test_other_components_that_are_unknown(run):
+    """With a DC offset a quad is no component; where all near raw frames have one shift, or the
+    opposite one, they tell one component only.
+    """
+    n = 6
+    sequence, _ = misfit(run, CANONICAL_SHIFTS)
+    assert others_of(run, n, sequence=sequence).across is not None
+    one_tap = replace(sequence, calibration=replace(sequence.calibration, dc_offset=0.5))
+    assert others_of(run, n, sequence=one_tap).across is None
+    telling = [
+        m
+        for m in range(n - 3, n + 4)
+        if m != n and abs(np.sin(sequence.shifts[m] - sequence.shifts[n])) > 0.5
+    ]
+    measured = ~np.isin(np.arange(sequence.frames), telling)
+    alike = replace(sequence, measured=measured)
+    assert others_of(run, n, sequence=alike).across is None
 
 
 def test_other_recordings_and_views_are_left_out(run):

@@ -68,6 +68,9 @@ class OtherFrames:
     """Of the static layer alone [1]."""
     normals: Float[Tensor, "2 H W"]
     """Unit vectors (x, y) across outlines, see :func:`normals_of`."""
+    across: Float[Tensor, "H W"] | None = None
+    """How much too small the rendered component of the phasor is that the raw frame does not
+    measure [quad units]; None: unknown."""
 
 
 def normals_of(distance: Float[Tensor, "H W"]) -> Float[Tensor, "2 H W"]:

@@ -14,6 +14,10 @@ Measurements are noisy and renderings smooth. What a residual exceeds its noise 
 3x3 pixels, is the error of the rendering: its share of both is the share of the residual that is
 taken over (a Wiener filter). So recordings without noise give the measured phasor, and noisy ones
 the rendered one where it is right.
+
+A mixed pixel is wrong by more than those around it, and outlines.py knows what noise does to its
+decision. So where other raw frames tell the other component too, see runs/moving.py, it gets a
+phasor with all of every residual.
 """
 
 from __future__ import annotations
@@ -149,6 +153,7 @@ class MeasuredPhasors:
         f_mod_hz: float,
         *,
         averaged: Bool[Tensor, "H W"] | None = None,
+        across: Float[Tensor, "H W"] | None = None,
     ) -> Phasor:
         """The phasor of a rendering, corrected where more is known.
 
@@ -159,6 +164,9 @@ class MeasuredPhasors:
             f_mod_hz: Modulation frequency [Hz].
             averaged: Where the mean of several quartets may replace what is rendered; None:
                 wherever there is one.
+            across: How much too small the rendered component across that of the raw frame is
+                [quad units], as other raw frames tell. With it, residuals are taken over whole;
+                None: the share of them that exceeds their noise.
         """
         rendered, sequence = rendered_phasor(rendering), self.sequence
         row = closed_form.row_of(sequence, time, camera, self.camera)
@@ -169,13 +177,15 @@ class MeasuredPhasors:
         phasor, one_tap = rendered, sequence.calibration.dc_offset != 0.0
         if at_frame and not one_tap and sequence.measured[n]:
             if sequence.frame_frequencies[n] == f_mod_hz:
-                phasor = self._with_quad(rendered, n)
+                phasor = self._with_quad(rendered, n, across)
         there = self.averaged[row] if averaged is None else averaged
         if rendering.source is not None:
             there = there | (rendering.source == CLOSED_FORM)
         residual = self.value[row, sequence.frequencies.index(f_mod_hz)] - rendered.value
         variance = self.variance[row]
-        share = _share_of_error(0.5 * residual.abs().square(), variance, there)
+        share = torch.ones_like(variance)
+        if across is None:
+            share = _share_of_error(0.5 * residual.abs().square(), variance, there)
         variance = rendered.variance_re + share * variance
         return Phasor(
             value=torch.where(there, rendered.value + share * residual, phasor.value),
@@ -184,28 +194,40 @@ class MeasuredPhasors:
             covariance=phasor.covariance.masked_fill(there, 0.0),
         )
 
-    def _with_quad(self, rendered: Phasor, n: int) -> Phasor:
+    def _with_quad(self, rendered: Phasor, n: int, across: Float[Tensor, "H W"] | None) -> Phasor:
         """With the component of raw frame n.
 
-        Its error is that of the median residual of the image: noise, and light that the model lacks
-        everywhere.
+        Its error is noise, if ``across`` is known and the residual taken over whole; otherwise that
+        of the median residual of the image: noise, and light that the model lacks everywhere.
         """
         re, im = rendered.value.real, rendered.value.imag
         shift = float(self.sequence.shifts[n])
-        measured = torch.as_tensor(self.sequence.quads[n], device=re.device, dtype=re.dtype)
-        residual = 2.0 * (measured - quad_from_phasor(re, im, torch.zeros_like(re), shift))
+        residual, noise = self.residual(re, im, n), 4.0 * self.of_quads[n % self.sequence.cycle]
         square = residual.square()
-        share = _share_of_error(square, 4.0 * self.of_quads[n % self.sequence.cycle])
-        along = rendered.variance_re + square.median() / MEDIAN_SQUARE
-        across = rendered.variance_re + _mean(square)
+        if across is None:
+            taken = _share_of_error(square, noise) * residual, torch.zeros_like(residual)
+            noise = square.median() / MEDIAN_SQUARE
+        else:
+            taken = residual, across
         cosine, sine = math.cos(shift), math.sin(shift)
-        taken = share * residual
+        along, aside = rendered.variance_re + noise, rendered.variance_re + _mean(square)
+        turned = taken[0] * cosine - taken[1] * sine, taken[0] * sine + taken[1] * cosine
         return Phasor(
-            value=rendered.value + torch.complex(taken * cosine, taken * sine),
-            variance_re=along * cosine**2 + across * sine**2,
-            variance_im=along * sine**2 + across * cosine**2,
-            covariance=(along - across) * cosine * sine,
+            value=rendered.value + torch.complex(*turned),
+            variance_re=along * cosine**2 + aside * sine**2,
+            variance_im=along * sine**2 + aside * cosine**2,
+            covariance=(along - aside) * cosine * sine,
         )
+
+    def residual(
+        self, re: Float[Tensor, "H W"], im: Float[Tensor, "H W"], n: int
+    ) -> Float[Tensor, "H W"]:
+        """How much too small a rendered phasor is along the shift of raw frame n [quad units], for
+        a sensor without DC offset.
+        """
+        measured = torch.as_tensor(self.sequence.quads[n], device=re.device, dtype=re.dtype)
+        shift = float(self.sequence.shifts[n])
+        return 2.0 * (measured - quad_from_phasor(re, im, torch.zeros_like(re), shift))
 
 
 def _share_of_error(

@@ -155,11 +155,15 @@ class Run(StoredRun):
             phasor = measured.corrected(rendering, time, camera, frequency, averaged=rests)
         if self.config["settings"].get("outlines") and not light_only:
             moves = self.fallback is not None and self.fallback.camera_moves
-            others = None
+            others, mixed = None, phasor
             if self._moving_outlines is not None:
                 others = self._moving_outlines.at(rendering, time, camera, frequency)
+            if measured is not None and others is not None and others.across is not None:
+                mixed = measured.corrected(
+                    rendering, time, camera, frequency, averaged=rests, across=others.across
+                )
             rendering = outlines.resolved(
-                rendering, sensor, phasor, camera_moves=moves, fitted=fitted, others=others
+                rendering, sensor, mixed, camera_moves=moves, fitted=fitted, others=others
             )
         if phasor is None or self.fallback is None:
             return rendering

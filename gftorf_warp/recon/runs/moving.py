@@ -1,27 +1,57 @@
-"""What a run of windows knows of outlines that move: its flow, and its static layer alone."""
+"""What a run of windows knows of outlines that move: its flow, its static layer alone, and what its
+Gaussians fail to explain of other raw frames.
+
+A raw frame measures one component of the phasor. Those before and after it measure the other one,
+mostly of surfaces that moved on. So the Gaussians of its quartet are rendered at their times, and
+what they fail to explain there is moved back with the surface, to be interpolated in time: where
+their outlines are a little wrong, they are so in all these raw frames.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ...data.temporal import camera_rests
 from ...render.api import Rendering, rasterize
 from ...scene.camera import Camera
-from ...scene.measured import frame_period
+from ...scene.gaussians import GaussianField
+from ...scene.measured import frame_period, sample
 from ...scene.windows import Windows
 from .. import closed_form
 from ..observations import input_of
-from ..other_frames import SPAN, OtherFrames, normals_of
+from ..other_frames import FLOW_WEIGHT_MIN, SPAN, OtherFrames, normals_of
 from ..phasors import MeasuredPhasors
 from ..settings import Input
 from .gaussians import widened
 from .stored import StoredRun
+
+TURNED = 0.7  # [1] sine between the shifts of two raw frames, from which one tells of the other
+FLOW_SIDE = 5  # [px] side of the box over which the velocity of a surface is averaged
+LIGHTEST = 0.02  # [1] mean weight of moving Gaussians there, below which nothing moves
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Present:
+    """The N Gaussians that exist at one time: the static layer, and what moves in its window."""
+
+    field: GaussianField
+    """At that time, without colour."""
+    velocity: Float[Tensor, "N 3"]
+    """[m per raw frame]"""
+    moves: Bool[Tensor, "N 1"]
+    """Whether they are of a moving surface."""
+
+    def moved(self, frames: float) -> GaussianField:
+        """Where the Gaussians are so many raw frames later, in the window or beyond it."""
+        return replace(self.field, mean=self.field.mean + frames * self.velocity)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +105,8 @@ class MovingOutlines:
         frames = [m for m in near if m != n and sequence.measured[m]]
         if not frames:
             return None
-        (moving, *flow), (behind, opacity) = self._flow(time, camera), self._static
+        present, (behind, opacity) = self._present(time), self._static
+        moving, *flow = images = self._flow(present, camera)
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=moving.device, dtype=torch.float32)
@@ -92,10 +123,46 @@ class MovingOutlines:
             behind=behind,
             opacity=opacity,
             normals=normals_of(rendering.distance),
+            across=self._across(n, frames, rendering, present, camera, images),
         )
 
-    def _flow(self, time: float, camera: Camera) -> Float[Tensor, "3 H W"]:
-        """Weight of moving Gaussians [1], and their velocity times it [px per raw frame]."""
+    def _across(
+        self,
+        n: int,
+        frames: list[int],
+        rendering: Rendering,
+        present: _Present,
+        camera: Camera,
+        moving: Float[Tensor, "3 H W"],
+    ) -> Float[Tensor, "H W"] | None:
+        """How much too small the component across raw frame n is rendered [quad units], from the
+        nearest of the other ``frames`` before and after that tell it; None if none does, or with a
+        DC offset.
+        """
+        sequence = self.measured.sequence
+        if sequence.calibration.dc_offset != 0.0:
+            return None
+        turns = {m: float(sequence.shifts[m] - sequence.shifts[n]) for m in frames}
+        telling = [m for m in frames if abs(math.sin(turns[m])) > TURNED]
+        before, after = [m for m in telling if m < n], [m for m in telling if m > n]
+        nearest = before[-1:] + after[:1]
+        if not nearest:
+            return None
+        own = self.measured.residual(rendering.phasor[0], rendering.phasor[1], n)
+        weight, *flow = avg_pool2d(moving, FLOW_SIDE, 1, FLOW_SIDE // 2, count_include_pad=False)
+        velocity = torch.stack(flow) / weight.clamp_min(FLOW_WEIGHT_MIN) * (weight > LIGHTEST)
+        times = [float(sequence.times[m] - sequence.times[n]) for m in nearest]
+        result = torch.zeros_like(own)
+        for m, time in zip(nearest, times, strict=True):
+            later = time / frame_period(sequence)
+            re, im, _ = self._rendering(present.moved(later), camera, "phasor").phasor
+            there = moved_back(self.measured.residual(re, im, m), later * velocity)
+            share = 1.0 if len(times) == 1 else 1.0 - abs(time) / (times[1] - times[0])
+            result += share * (there - math.cos(turns[m]) * own) / math.sin(turns[m])
+        return result
+
+    def _present(self, time: float) -> _Present:
+        """The Gaussians of the window at that time."""
         run = self.run
         window = self.motion.keys_at(time).index[0] // 2
         start, end = self.motion.times[window : window + 2]
@@ -104,18 +171,16 @@ class MovingOutlines:
         binding, field = run.binding[rows], run.field.map(lambda values: values[rows])
         before, after = self.motion.at_keys(binding, keys).offset
         velocity = (after - before) * frame_period(self.measured.sequence) / (end - start)
-        field = field.moved(*self.motion.at(binding, time))
-        flow = camera.project(field.mean + velocity) - camera.project(field.mean)
-        moves = (binding[:, :1] > 0.0).to(flow)
+        field = replace(field.moved(*self.motion.at(binding, time)), colour_sh=None)
+        return _Present(field=field, velocity=velocity, moves=binding[:, :1] > 0.0)
+
+    def _flow(self, present: _Present, camera: Camera) -> Float[Tensor, "3 H W"]:
+        """Weight of moving Gaussians [1], and their velocity times it [px per raw frame]."""
+        field, later = present.field, present.moved(1.0)
+        flow = camera.project(later.mean) - camera.project(field.mean)
+        moves = present.moves.to(flow)
         extra = torch.cat([moves, torch.nan_to_num(flow) * moves], dim=1)
-        rendering = rasterize(
-            widened(run, field, camera),
-            camera,
-            run.sensor,
-            run.render_settings,
-            extra=extra,
-            images=("opacity",),
-        )
+        rendering = self._rendering(field, camera, "opacity", extra=extra)
         assert rendering.extra is not None
         return rendering.extra
 
@@ -125,12 +190,29 @@ class MovingOutlines:
         run, camera = self.run, self.measured.camera
         rows: Int[Tensor, "S"] = (run.binding[:, 0] == 0.0).nonzero()[:, 0]
         field = replace(run.field.map(lambda values: values[rows]), colour_sh=None)
-        rendering = rasterize(
-            widened(run, field, camera),
-            camera,
-            run.sensor,
-            run.render_settings,
-            images=("phasor", "opacity"),
-        )
-        re, im, _ = rendering.phasor / run.quad_scale
+        rendering = self._rendering(field, camera, "phasor", "opacity")
+        re, im, _ = rendering.phasor
         return torch.complex(re, im), rendering.opacity
+
+    def _rendering(
+        self,
+        field: GaussianField,
+        camera: Camera,
+        *images: str,
+        extra: Float[Tensor, "N D"] | None = None,
+    ) -> Rendering:
+        """Images of Gaussians without colour, phasors in the units of the sequence."""
+        run, field = self.run, widened(self.run, field, camera)
+        rendering = rasterize(
+            field, camera, run.sensor, run.render_settings, extra=extra, images=images
+        )
+        return replace(rendering, phasor=rendering.phasor / run.quad_scale)
+
+
+def moved_back(
+    image: Float[Tensor, "H W"], displacement: Float[Tensor, "2 H W"]
+) -> Float[Tensor, "H W"]:
+    """An image at x + displacement(x) [px], bilinear, edges repeated."""
+    y, x = (torch.arange(side, device=image.device) + 0.5 for side in image.shape)
+    there = torch.stack(torch.meshgrid(x, y, indexing="xy")) + displacement
+    return sample(image[None], there.flatten(1).T).view(image.shape)
