@@ -42,7 +42,7 @@ from .straight import Outline, along_outline
 
 OUTLINE = 3  # in a map of sources, see fallback.py
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns)
-PASSES = 2  # the second one sees neighbours that are no mixtures any more
+PASSES = 3  # later ones see neighbours that are no mixtures any more
 SHARES = 21  # of the area of a pixel, from 0 to 1
 BLUR = 0.065  # [pixels] outlines are not straight: how sure the share makes of the centre
 SMOOTH = 1.0  # [steps] two neighbours on one side of a mixed pixel differ by less: one may be mixed
@@ -50,7 +50,7 @@ SAME_SURFACE = 0.4  # [steps] two pixels on one surface differ by less
 GAINS = (0.6, 1.0, 1.4)  # [1] of an extrapolated amplitude all along an outline: a side face
 GAIN_CHANCES = (0.15, 0.7, 0.15)  # [1] of each
 FRONT_SPREAD = 0.25  # [1] standard deviation of an extrapolated amplitude after its gain, relative
-BACK_SPREAD = 0.2  # [1] the same of a surface that goes on behind another one
+BACK_SPREAD = 0.17  # [1] the same of a surface that goes on behind another one
 EXTRAPOLATION = 0.3  # [1] at most, of the logarithm of the amplitude
 HALF = 0.5  # [1] of the change of a closed form that is kept
 QUARTER = 0.25  # [1] of the fit in a closed form that it is averaged with
