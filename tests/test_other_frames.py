@@ -268,14 +268,19 @@ def test_a_rendering_at_a_raw_frame_uses_it(run):
     measured = MeasuredPhasors.of(sequence, camera, run.field.device)
     rests = run.fallback.rests_at(fitted, time, camera)
     others = MovingOutlines.of(run, measured).at(rendering, time, camera, f_mod_hz)
-    assert others.across is not None
+    assert others.quadrature is not None
     given = run.corrected(fitted, time, camera)
     parts, without = (
         outlines.resolved(
             rendering,
             sensor,
             measured.corrected(
-                rendering, time, camera, f_mod_hz, averaged=rests, across=which and which.across
+                rendering,
+                time,
+                camera,
+                f_mod_hz,
+                averaged=rests,
+                quadrature=which and which.quadrature,
             ),
             others=which,
         ).distance
@@ -313,11 +318,14 @@ def rendered(run):
     return np.stack([re + 1j * im for re, im, _ in phasors])
 
 
-@pytest.mark.parametrize("shifts", [CANONICAL_SHIFTS, THIRDS])
-@pytest.mark.parametrize("n", [0, 5, 6, 9, 14])
-def test_other_raw_frames_tell_the_other_component(run, shifts, n):
-    """Where all phasors are wrong by one factor, on the wall and on the box that moves by up to
-    two pixels from one raw frame to the next; inside both, since outlines of two windows differ.
+@pytest.mark.parametrize(
+    ("shifts", "n"),
+    [(CANONICAL_SHIFTS, n) for n in (0, 5, 6, 9, 15)] + [(THIRDS, n) for n in (0, 5, 14)],
+)
+def test_other_raw_frames_tell_the_component_in_quadrature(run, shifts, n):
+    """Where all phasors are wrong by one factor, on the wall and on the box that moves by half a
+    pixel from one raw frame to the next; inside both, since outlines of two windows differ. Shifts
+    may be a third of a turn apart.
     """
     sequence, wrong = misfit(run, shifts)
     others = others_of(run, n, sequence=sequence)
@@ -327,11 +335,26 @@ def test_other_raw_frames_tell_the_other_component(run, shifts, n):
     wall = cv2.erode((moving < 0.02).astype(np.uint8), np.ones((9, 9))) > 0
     for inside, limit in ((box, 0.2), (wall, 0.1)):
         assert inside.sum() > 50
-        apart = np.abs(others.across.numpy() - truth)[inside]
+        apart = np.abs(others.quadrature.numpy() - truth)[inside]
         assert np.median(apart) < limit * np.abs(wrong[n])[inside].mean()
 
 
-def test_the_other_component_is_moved_with_its_surface(run, monkeypatch):
+def test_the_nearest_raw_frames_are_interpolated_in_time(run):
+    """What is missing grows linearly from raw frame 7, one before, to 10, two after, which tell the
+    component; those farther away would mislead.
+    """
+    n = 8
+    factor = np.full(run.sequence().frames, 1.4 + 0.5j)
+    factor[7:11] = 1.0 + 0.1j * np.arange(1, 5)
+    sequence, wrong = misfit(run, CANONICAL_SHIFTS, factor[:, None, None])
+    others = others_of(run, n, sequence=sequence)
+    truth = (wrong[n] * np.exp(-1j * sequence.shifts[n])).imag
+    wall = cv2.erode((others.moving.numpy() < 0.02).astype(np.uint8), np.ones((9, 9))) > 0
+    apart = np.abs(others.quadrature.numpy() - truth)[wall]
+    assert np.median(apart) < 1e-3 * np.abs(wrong[n])[wall].mean()
+
+
+def test_the_component_is_moved_with_its_surface(run, monkeypatch):
     """Stripes on the box, of a period of five pixels, are found where they are."""
     n = 6
     velocity = flow(n, 1)[0][seen(n)[2]].mean()
@@ -343,56 +366,69 @@ def test_the_other_component_is_moved_with_its_surface(run, monkeypatch):
     errors = []
     for moves in (True, False):
         if not moves:
-            monkeypatch.setattr("gftorf_warp.recon.runs.moving.moved_back", lambda image, _: image)
+            monkeypatch.setattr("gftorf_warp.recon.quadrature.displaced", lambda image, _: image)
         others = others_of(run, n, sequence=sequence)
         box = others.moving.numpy() > 0.9
-        errors.append(np.square(others.across.numpy() - truth)[box].mean())
+        errors.append(np.square(others.quadrature.numpy() - truth)[box].mean())
     assert errors[1] > 0.1 * np.square(truth[box]).mean()
     assert errors[0] < 0.3 * errors[1]
 
 
-def test_a_phasor_is_mended_in_both_components(run):
-    """The quad of the raw frame mends one, the other raw frames the other one: whole, where less
-    would be taken of it without them; and with the noise of the quad along it.
+def test_a_phasor_is_corrected_in_both_components(run):
+    """The quad of the raw frame gives one, other raw frames the one in quadrature: whole, even if
+    the noise is as large as the residuals, where without them a part would be taken; the same where
+    quartets are averaged. The error in phase is the noise of the quad.
     """
     sequence, wrong = misfit(run, CANONICAL_SHIFTS)
     n, camera, f_mod_hz = 6, run.camera, float(run.sensor.f_mod_hz)
     time = float(sequence.times[n])
     measured = MeasuredPhasors.of(sequence, camera, run.field.device)
     rendering = run.renderer(("distance", "phasor"), corrected=False)(time, camera)
+    square = measured.residual(*rendering.phasor[:2], n).square().mean()
+    loud = replace(
+        measured,
+        of_quads=0.25 * square.expand_as(measured.of_quads),
+        variance=torch.full_like(measured.variance, float(square)),
+    )
     turn = np.exp(-1j * sequence.shifts[n])
-    across = torch.as_tensor((wrong[n] * turn).imag, dtype=torch.float32)
-    nowhere = torch.zeros_like(across, dtype=torch.bool)
-    given = measured.corrected(rendering, time, camera, f_mod_hz, averaged=nowhere, across=across)
+    quadrature = torch.as_tensor((wrong[n] * turn).imag, dtype=torch.float32)
+    nowhere = torch.zeros_like(quadrature, dtype=torch.bool)
     right = torch.complex(*rendering.phasor[:2]) + torch.as_tensor(wrong[n])
-    torch.testing.assert_close(given.value, right.to(given.value), atol=1e-5, rtol=1e-4)
+    for averaged, value in ((nowhere, right), (~nowhere, loud.value[n // 4, 0])):
+        whole, part = (
+            loud.corrected(rendering, time, camera, f_mod_hz, averaged=averaged, quadrature=which)
+            for which in (quadrature, None)
+        )
+        torch.testing.assert_close(whole.value, value.to(whole.value), atol=1e-5, rtol=1e-4)
+        assert (part.value - value).abs().mean() > 0.1 * float(square.sqrt())
+    given = loud.corrected(
+        rendering, time, camera, f_mod_hz, averaged=nowhere, quadrature=quadrature
+    )
     cosine, sine = turn.real, -turn.imag
-    along = (
+    in_phase = (
         given.variance_re * cosine**2
         + given.variance_im * sine**2
         + 2.0 * given.covariance * cosine * sine
     )
-    noise = along - rendered_phasor(rendering).variance_re
-    torch.testing.assert_close(noise, 4.0 * measured.of_quads[n % 4], atol=1e-9, rtol=1e-2)
+    noise = in_phase - rendered_phasor(rendering).variance_re
+    torch.testing.assert_close(noise, 4.0 * loud.of_quads[n % 4], atol=1e-9, rtol=1e-2)
 
 
-def test_other_components_that_are_unknown(run):
-    """With a DC offset a quad is no component; where all near raw frames have one shift, or the
-    opposite one, they tell one component only.
+def test_components_in_quadrature_that_are_unknown(run):
+    """With a DC offset a quad is no component; where all near raw frames have nearly one shift, or
+    the opposite one, they tell one component only; raw frames after the last complete quartet.
     """
     n = 6
     sequence, _ = misfit(run, CANONICAL_SHIFTS)
-    assert others_of(run, n, sequence=sequence).across is not None
+    assert others_of(run, n, sequence=sequence).quadrature is not None
     one_tap = replace(sequence, calibration=replace(sequence.calibration, dc_offset=0.5))
-    assert others_of(run, n, sequence=one_tap).across is None
-    telling = [
-        m
-        for m in range(n - 3, n + 4)
-        if m != n and abs(np.sin(sequence.shifts[m] - sequence.shifts[n])) > 0.5
-    ]
-    measured = ~np.isin(np.arange(sequence.frames), telling)
-    alike = replace(sequence, measured=measured)
-    assert others_of(run, n, sequence=alike).across is None
+    assert others_of(run, n, sequence=one_tap).quadrature is None
+    alike = np.resize([0.0, 0.5, np.pi, np.pi + 0.5], sequence.frames)
+    sequence, _ = misfit(run, alike)
+    assert others_of(run, n, sequence=sequence).quadrature is None
+    sequence, _ = misfit(run, THIRDS)
+    assert others_of(run, 14, sequence=sequence).quadrature is not None
+    assert others_of(run, 15, sequence=sequence).quadrature is None
 
 
 def test_other_recordings_and_views_are_left_out(run):

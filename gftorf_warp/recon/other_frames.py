@@ -12,8 +12,9 @@ is within a pixel of its outline the share w,
 
 with the unknown gain g of outlines.py, here normal about each of its values. In every raw frame,
 the three pixels nearest to the outline are compared. All of them share the errors of one velocity
-and of two amplitudes: so these are wide, positions are the less certain the longer the time
-between, and only a part of the logarithm of the likelihood counts.
+and of two amplitudes, and the nearest ones are used a second time by quadrature.py: so these are
+wide, positions are the less certain the longer the time between, and only a part of the logarithm
+of the likelihood counts.
 """
 
 from __future__ import annotations
@@ -68,9 +69,9 @@ class OtherFrames:
     """Of the static layer alone [1]."""
     normals: Float[Tensor, "2 H W"]
     """Unit vectors (x, y) across outlines, see :func:`normals_of`."""
-    across: Float[Tensor, "H W"] | None = None
-    """How much too small the rendered component of the phasor is that the raw frame does not
-    measure [quad units]; None: unknown."""
+    quadrature: Float[Tensor, "H W"] | None = None
+    """How much too small the component in quadrature with the shift of the raw frame is rendered
+    [quad units], see quadrature.py; None: unknown."""
 
 
 def normals_of(distance: Float[Tensor, "H W"]) -> Float[Tensor, "2 H W"]:

@@ -16,8 +16,8 @@ taken over (a Wiener filter). So recordings without noise give the measured phas
 the rendered one where it is right.
 
 A mixed pixel is wrong by more than those around it, and outlines.py knows what noise does to its
-decision. So where other raw frames tell the other component too, see runs/moving.py, it gets a
-phasor with all of every residual.
+decision. So where other raw frames tell the component in quadrature too, see quadrature.py, it gets
+a phasor with all of every residual.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class MeasuredPhasors:
         f_mod_hz: float,
         *,
         averaged: Bool[Tensor, "H W"] | None = None,
-        across: Float[Tensor, "H W"] | None = None,
+        quadrature: Float[Tensor, "H W"] | None = None,
     ) -> Phasor:
         """The phasor of a rendering, corrected where more is known.
 
@@ -164,9 +164,9 @@ class MeasuredPhasors:
             f_mod_hz: Modulation frequency [Hz].
             averaged: Where the mean of several quartets may replace what is rendered; None:
                 wherever there is one.
-            across: How much too small the rendered component across that of the raw frame is
-                [quad units], as other raw frames tell. With it, residuals are taken over whole;
-                None: the share of them that exceeds their noise.
+            quadrature: How much too small the component in quadrature with the shift of the raw
+                frame is rendered [quad units]. With it, residuals are taken over whole; None: the
+                share of them that exceeds their noise.
         """
         rendered, sequence = rendered_phasor(rendering), self.sequence
         row = closed_form.row_of(sequence, time, camera, self.camera)
@@ -177,14 +177,14 @@ class MeasuredPhasors:
         phasor, one_tap = rendered, sequence.calibration.dc_offset != 0.0
         if at_frame and not one_tap and sequence.measured[n]:
             if sequence.frame_frequencies[n] == f_mod_hz:
-                phasor = self._with_quad(rendered, n, across)
+                phasor = self._with_quad(rendered, n, quadrature)
         there = self.averaged[row] if averaged is None else averaged
         if rendering.source is not None:
             there = there | (rendering.source == CLOSED_FORM)
         residual = self.value[row, sequence.frequencies.index(f_mod_hz)] - rendered.value
         variance = self.variance[row]
         share = torch.ones_like(variance)
-        if across is None:
+        if quadrature is None:
             share = _share_of_error(0.5 * residual.abs().square(), variance, there)
         variance = rendered.variance_re + share * variance
         return Phasor(
@@ -194,29 +194,28 @@ class MeasuredPhasors:
             covariance=phasor.covariance.masked_fill(there, 0.0),
         )
 
-    def _with_quad(self, rendered: Phasor, n: int, across: Float[Tensor, "H W"] | None) -> Phasor:
-        """With the component of raw frame n.
+    def _with_quad(
+        self, rendered: Phasor, n: int, quadrature: Float[Tensor, "H W"] | None
+    ) -> Phasor:
+        """With the component of raw frame n, in phase with its shift.
 
-        Its error is noise, if ``across`` is known and the residual taken over whole; otherwise that
-        of the median residual of the image: noise, and light that the model lacks everywhere.
+        Its error is noise, if its residual is taken over whole; otherwise that of the median
+        residual of the image: noise, and light that the model lacks everywhere. The error of the
+        component in quadrature is that of the residuals around it.
         """
-        re, im = rendered.value.real, rendered.value.imag
         shift = float(self.sequence.shifts[n])
-        residual, noise = self.residual(re, im, n), 4.0 * self.of_quads[n % self.sequence.cycle]
-        square = residual.square()
-        if across is None:
-            taken = _share_of_error(square, noise) * residual, torch.zeros_like(residual)
+        residual = self.residual(rendered.value.real, rendered.value.imag, n)
+        square, noise = residual.square(), 4.0 * self.of_quads[n % self.sequence.cycle]
+        if quadrature is None:
+            residual, quadrature = _share_of_error(square, noise) * residual, 0.0 * residual
             noise = square.median() / MEDIAN_SQUARE
-        else:
-            taken = residual, across
+        in_phase, in_quadrature = rendered.variance_re + noise, rendered.variance_re + _mean(square)
         cosine, sine = math.cos(shift), math.sin(shift)
-        along, aside = rendered.variance_re + noise, rendered.variance_re + _mean(square)
-        turned = taken[0] * cosine - taken[1] * sine, taken[0] * sine + taken[1] * cosine
         return Phasor(
-            value=rendered.value + torch.complex(*turned),
-            variance_re=along * cosine**2 + aside * sine**2,
-            variance_im=along * sine**2 + aside * cosine**2,
-            covariance=(along - aside) * cosine * sine,
+            value=rendered.value + torch.complex(residual, quadrature) * complex(cosine, sine),
+            variance_re=in_phase * cosine**2 + in_quadrature * sine**2,
+            variance_im=in_phase * sine**2 + in_quadrature * cosine**2,
+            covariance=(in_phase - in_quadrature) * cosine * sine,
         )
 
     def residual(

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, pad
+from torch.nn.functional import pad
 
 from ..data.flow import sample
 from ..data.sequence import Sequence
+from .measured import displaced
 
 POOL = 5  # [px] side of the box over which squared residuals are averaged
 # squared difference from the background over noise, from which a raw frame shows something else
@@ -233,15 +234,10 @@ def _along_fields(
     share: Float[np.ndarray, "K"],
 ) -> Float[Tensor, "2 B K h w"]:
     """Images of every slot at x + share flow(x), bilinear, edges repeated."""
-    height, width = images.shape[2:]
-    y, x = (torch.arange(side, device=images.device) + 0.5 for side in (height, width))
-    centre = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    size = images.new_tensor([width, height])
     along = []
     for k, s in enumerate(share.tolist()):
-        grid = 2.0 * (centre + s * fields.permute(0, 2, 3, 1)) / size - 1.0
         image = images[:, k].expand(len(fields), -1, -1, -1)
-        along.append(grid_sample(image, grid, padding_mode="border", align_corners=False))
+        along.append(displaced(image, s * fields))
     return torch.stack(along, dim=2).transpose(0, 1).contiguous()
 
 

@@ -104,6 +104,18 @@ def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float
     return values[0, :, 0]
 
 
+def displaced(
+    images: Float[Tensor, "B C H W"], displacement: Float[Tensor, "B 2 H W"]
+) -> Float[Tensor, "B C H W"]:
+    """Images at x + displacement(x) [px], bilinear, repeated beyond the border."""
+    height, width = images.shape[2:]
+    y, x = (torch.arange(side, device=images.device) + 0.5 for side in (height, width))
+    centre = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    size = images.new_tensor([width, height])
+    grid = 2.0 * (centre + displacement.permute(0, 2, 3, 1)) / size - 1.0
+    return torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+
+
 def flow_at(
     sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]
 ) -> Float[Tensor, "P 2"] | None:

@@ -155,15 +155,15 @@ class Run(StoredRun):
             phasor = measured.corrected(rendering, time, camera, frequency, averaged=rests)
         if self.config["settings"].get("outlines") and not light_only:
             moves = self.fallback is not None and self.fallback.camera_moves
-            others, mixed = None, phasor
+            others, whole = None, phasor
             if self._moving_outlines is not None:
                 others = self._moving_outlines.at(rendering, time, camera, frequency)
-            if measured is not None and others is not None and others.across is not None:
-                mixed = measured.corrected(
-                    rendering, time, camera, frequency, averaged=rests, across=others.across
+            if measured is not None and others is not None and others.quadrature is not None:
+                whole = measured.corrected(
+                    rendering, time, camera, frequency, averaged=rests, quadrature=others.quadrature
                 )
             rendering = outlines.resolved(
-                rendering, sensor, mixed, camera_moves=moves, fitted=fitted, others=others
+                rendering, sensor, whole, camera_moves=moves, fitted=fitted, others=others
             )
         if phasor is None or self.fallback is None:
             return rendering

@@ -1,41 +1,29 @@
-"""What a run of windows knows of outlines that move: its flow, its static layer alone, and what its
-Gaussians fail to explain of other raw frames.
-
-A raw frame measures one component of the phasor. Those before and after it measure the other one,
-mostly of surfaces that moved on. So the Gaussians of its quartet are rendered at their times, and
-what they fail to explain there is moved back with the surface, to be interpolated in time: where
-their outlines are a little wrong, they are so in all these raw frames.
-"""
+"""What a run of windows knows of outlines that move: its flow, and its static layer alone."""
 
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from ...data.temporal import camera_rests
 from ...render.api import Rendering, rasterize
 from ...scene.camera import Camera
 from ...scene.gaussians import GaussianField
-from ...scene.measured import frame_period, sample
+from ...scene.measured import frame_period
 from ...scene.windows import Windows
 from .. import closed_form
 from ..observations import input_of
-from ..other_frames import FLOW_WEIGHT_MIN, SPAN, OtherFrames, normals_of
+from ..other_frames import SPAN, OtherFrames, normals_of
 from ..phasors import MeasuredPhasors
+from ..quadrature import quadrature_residual
 from ..settings import Input
 from .gaussians import widened
 from .stored import StoredRun
-
-TURNED = 0.7  # [1] sine between the shifts of two raw frames, from which one tells of the other
-FLOW_SIDE = 5  # [px] side of the box over which the velocity of a surface is averaged
-LIGHTEST = 0.02  # [1] mean weight of moving Gaussians there, below which nothing moves
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +73,7 @@ class MovingOutlines:
         """What other raw frames measured of the outlines of a rendering.
 
         Args:
-            rendering: With its distance.
+            rendering: With its distance and phasor.
             time: Of the rendering [s].
             camera: Of the rendering.
             f_mod_hz: Modulation frequency [Hz].
@@ -107,6 +95,16 @@ class MovingOutlines:
             return None
         present, (behind, opacity) = self._present(time), self._static
         moving, *flow = images = self._flow(present, camera)
+        quadrature = None
+        if closed_form.row_of(sequence, time, camera, self.measured.camera) is not None:
+            quadrature = quadrature_residual(
+                self.measured,
+                n,
+                frames,
+                rendering.phasor,
+                lambda later: self._rendering(present.moved(later), camera, "phasor").phasor,
+                images,
+            )
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=moving.device, dtype=torch.float32)
@@ -123,43 +121,8 @@ class MovingOutlines:
             behind=behind,
             opacity=opacity,
             normals=normals_of(rendering.distance),
-            across=self._across(n, frames, rendering, present, camera, images),
+            quadrature=quadrature,
         )
-
-    def _across(
-        self,
-        n: int,
-        frames: list[int],
-        rendering: Rendering,
-        present: _Present,
-        camera: Camera,
-        moving: Float[Tensor, "3 H W"],
-    ) -> Float[Tensor, "H W"] | None:
-        """How much too small the component across raw frame n is rendered [quad units], from the
-        nearest of the other ``frames`` before and after that tell it; None if none does, or with a
-        DC offset.
-        """
-        sequence = self.measured.sequence
-        if sequence.calibration.dc_offset != 0.0:
-            return None
-        turns = {m: float(sequence.shifts[m] - sequence.shifts[n]) for m in frames}
-        telling = [m for m in frames if abs(math.sin(turns[m])) > TURNED]
-        before, after = [m for m in telling if m < n], [m for m in telling if m > n]
-        nearest = before[-1:] + after[:1]
-        if not nearest:
-            return None
-        own = self.measured.residual(rendering.phasor[0], rendering.phasor[1], n)
-        weight, *flow = avg_pool2d(moving, FLOW_SIDE, 1, FLOW_SIDE // 2, count_include_pad=False)
-        velocity = torch.stack(flow) / weight.clamp_min(FLOW_WEIGHT_MIN) * (weight > LIGHTEST)
-        times = [float(sequence.times[m] - sequence.times[n]) for m in nearest]
-        result = torch.zeros_like(own)
-        for m, time in zip(nearest, times, strict=True):
-            later = time / frame_period(sequence)
-            re, im, _ = self._rendering(present.moved(later), camera, "phasor").phasor
-            there = moved_back(self.measured.residual(re, im, m), later * velocity)
-            share = 1.0 if len(times) == 1 else 1.0 - abs(time) / (times[1] - times[0])
-            result += share * (there - math.cos(turns[m]) * own) / math.sin(turns[m])
-        return result
 
     def _present(self, time: float) -> _Present:
         """The Gaussians of the window at that time."""
@@ -207,12 +170,3 @@ class MovingOutlines:
             field, camera, run.sensor, run.render_settings, extra=extra, images=images
         )
         return replace(rendering, phasor=rendering.phasor / run.quad_scale)
-
-
-def moved_back(
-    image: Float[Tensor, "H W"], displacement: Float[Tensor, "2 H W"]
-) -> Float[Tensor, "H W"]:
-    """An image at x + displacement(x) [px], bilinear, edges repeated."""
-    y, x = (torch.arange(side, device=image.device) + 0.5 for side in image.shape)
-    there = torch.stack(torch.meshgrid(x, y, indexing="xy")) + displacement
-    return sample(image[None], there.flatten(1).T).view(image.shape)
