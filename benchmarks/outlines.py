@@ -3,13 +3,13 @@
     python benchmarks/outlines.py fit OUT SEQUENCE... [--images 1500]   # ours/random-3 is simulated
     python benchmarks/outlines.py score OUT [SPEC...]   # such as outlines.FRONT_SPREAD=.3
 
-`fit` reconstructs with preset best on the CPU and stores renderings, the fallback's distances and
-the sequence's path under OUT. A SEQUENCE named random-N that does not exist is simulated with
-engine mesh at 96x72, 24 raw frames. `score` prints the error of d over that of the closed form on
-the same pixels, geometric means over the sequences of one parent folder, on every fifth raw frame,
-for all, moving and static pixels and for the static ones beside steps and elsewhere: of the
-fallback alone, with outlines, and with constants of recon/outlines.py, recon/other_frames.py,
-recon/phasors.py or recon/straight.py changed (several in one SPEC by commas).
+`fit` reconstructs with preset best on the CPU and stores renderings of the fit under OUT. A
+SEQUENCE named random-N that does not exist is simulated with engine mesh at 96x72, 24 raw frames.
+`score` prints the error of d over that of the closed form on the same pixels, geometric means over
+the sequences of one parent folder, on every fifth raw frame, for all, moving and static pixels and
+for the static ones beside steps and elsewhere: of the fallback alone, with outlines, and with
+constants of recon/outlines.py, recon/other_frames.py, recon/phasors.py, recon/quadrature.py or
+recon/straight.py changed (several in one SPEC by commas).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gftorf_warp.data.steps import near_steps
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import camera_at
-from gftorf_warp.recon import other_frames, outlines, phasors, straight
+from gftorf_warp.recon import other_frames, outlines, phasors, quadrature, straight
 from gftorf_warp.recon.raw_frames import RawFrames
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render.api import Rendering
@@ -42,9 +42,11 @@ MODULES = {
     "outlines": outlines,
     "other_frames": other_frames,
     "phasors": phasors,
+    "quadrature": quadrature,
     "straight": straight,
 }
 Stored = dict[str, Any]
+Rule = Callable[[int, Rendering], torch.Tensor]  # distances of a raw frame from its rendering
 
 
 def fit(out: Path, folder: Path, images: int) -> None:
@@ -63,22 +65,16 @@ def fit(out: Path, folder: Path, images: int) -> None:
 
 
 def renderings_of(run: Run) -> list[tuple[int, Rendering]]:
-    """Raw frames with their renderings after the fallback, before outlines."""
-    sequence, found = run.sequence(), []
+    """Raw frames with their renderings of the fit alone."""
+    sequence = run.sequence()
     frames = scored_frames(sequence)[FIRST::EVERY]
     rendered = RawFrames(run, sequence, ("distance", "phasor", "opacity"), kept=frames)
-    for n in frames:
-        rendering = rendered(n, float(sequence.frame_frequencies[n]))
-        if run.fallback is not None:
-            time, camera = float(sequence.times[n]), rendered.camera_at(n)
-            rendering = run.fallback.applied(rendering, time, camera)
-        found.append((n, rendering))
-    return found
+    return [(n, rendered(n, float(sequence.frame_frequencies[n]))) for n in frames]
 
 
-def errors(stored: Stored, resolved: Callable[[int, Rendering], torch.Tensor]) -> dict[str, float]:
+def errors(stored: Stored, resolved: Rule) -> dict[str, float]:
     """Mean squared error over that of the closed form, by class of pixels."""
-    sequence = read(stored["sequence"])
+    sequence = stored["open"].sequence()
     frames = [n for n, _ in stored["renderings"]]
     truth = known_distance(read_truth(sequence))
     moving, static = moving_and_static(truth, frames, cycle=sequence.cycle)
@@ -101,27 +97,24 @@ def errors(stored: Stored, resolved: Callable[[int, Rendering], torch.Tensor]) -
     return ratios
 
 
-def rule(stored: Stored, spec: str) -> Callable[[int, Rendering], torch.Tensor]:
-    """A function of raw frame and rendering: its distances after outlines, with changed
-    constants.
-    """
-    run, measured, moving = stored["open"], stored["measured"], stored["moving"]
-    frequency = float(run.sensor.f_mod_hz)
-    for change in filter(None, spec.split(",")):
+def rule(run: Run, spec: str) -> Rule:
+    """Distances of the fallback alone, or of a run with changed constants."""
+    for change in filter(None, spec.split(",") if spec != "fallback" else ()):
         name, _, value = change.partition("=")
         module, _, constant = name.partition(".")
         if not hasattr(MODULES[module], constant):
             raise SystemExit(f"recon/{module}.py has no {constant}")
         setattr(MODULES[module], constant, type(getattr(MODULES[module], constant))(value))
 
-    def resolved(n: int, rendering: Rendering) -> torch.Tensor:
+    def distances(n: int, rendering: Rendering) -> torch.Tensor:
         time = float(run.sequence().times[n])
         camera = camera_at(run, run.sequence(), time)
-        phasor = measured and measured.corrected(rendering, time, camera, frequency)
-        others = moving and moving.at(rendering, time, camera, frequency)
-        return outlines.resolved(rendering, run.sensor, phasor, others=others).distance
+        if spec != "fallback":
+            return run.corrected(rendering, time, camera).distance
+        replaced = run.fallback and run.fallback.applied(rendering, time, camera)
+        return (replaced or rendering).distance
 
-    return resolved
+    return distances
 
 
 def score(out: Path, specs: list[str]) -> None:
@@ -129,9 +122,7 @@ def score(out: Path, specs: list[str]) -> None:
     groups: dict[str, list[Stored]] = {}
     for path in sorted(out.glob("*.pt")):
         stored = torch.load(path, weights_only=False)  # a file of our own
-        run = stored["open"] = Run.open(stored["run"], "cpu")
-        stored["measured"], stored["moving"] = run._measured_phasors, run._moving_outlines
-        stored["sequence"] = run.config["sequence"]
+        stored["open"] = Run.open(stored["run"], "cpu")
         groups.setdefault(path.stem.partition("-")[0], []).append(stored)
     constants = {
         (module, name): value
@@ -141,10 +132,7 @@ def score(out: Path, specs: list[str]) -> None:
     }
     for spec in ("fallback", "", *specs):
         for group, sequences in groups.items():
-            found = [
-                errors(one, (lambda _, r: r.distance) if spec == "fallback" else rule(one, spec))
-                for one in sequences
-            ]
+            found = [errors(one, rule(one["open"], spec)) for one in sequences]
             for (module, name), value in constants.items():
                 setattr(module, name, value)
             means = {

@@ -141,17 +141,22 @@ def test_where_the_fit_fails_the_quartet_itself_is_taken(box):
 
 
 def test_another_surface_beside_what_moves_stays_if_the_fit_explains_the_quads(box, monkeypatch):
-    """Up to five pixels from what changes, not elsewhere; its phasor is not the mean then."""
+    """Up to five pixels from what changes, not elsewhere; its phasor is not the mean then. The
+    limit of the chi-square is one that noise does not reach: 10 has a chance of 1e-8.
+    """
     measured, quads, truth = box
     monkeypatch.setattr(fallback, "BESIDE", 0.1)
+    monkeypatch.setattr(fallback, "AS_GOOD", 10.0)
+    there = np.stack([seen(n)[2] for n in range(12, 16)])
+    covered = (there.any(axis=0) & ~there.all(axis=0)).astype(np.uint8)  # for a part of the quartet
     changes = (~agreement(measured)[3]).astype(np.uint8)
-    beside = (cv2.dilate(changes, np.ones((11, 11), np.uint8)) > 0) & (changes == 0)
+    beside = (cv2.dilate(covered, np.ones((11, 11), np.uint8)) > 0) & (changes == 0)
     beside &= cv2.dilate(changes, np.ones((5, 5), np.uint8)) == 0
     nearer = np.where(beside | (np.arange(36)[:, None] < 2), truth[13] - 0.5, truth[13])
     good, time = fallback_of(measured, quads), 13 / FRAME_RATE_HZ
     distance, source, _ = applied(good, nearer, 13)
     assert beside.sum() > 100
-    assert (source[beside] == FIT).mean() > 0.75, "all but those of more noise"
+    assert (source[beside] == FIT).mean() > 0.97
     assert (source[:2][~beside[:2]] == TEMPORAL).all()
     assert (distance[:2][~beside[:2]] > truth[13][:2][~beside[:2]] - 0.05).all()
     rests = good.rests_at(rendering(nearer), time, good.camera).numpy()

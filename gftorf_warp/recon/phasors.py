@@ -207,7 +207,8 @@ class MeasuredPhasors:
         residual = self.residual(rendered.value.real, rendered.value.imag, n)
         square, noise = residual.square(), 4.0 * self.of_quads[n % self.sequence.cycle]
         if quadrature is None:
-            residual, quadrature = _share_of_error(square, noise) * residual, 0.0 * residual
+            residual = _share_of_error(square, noise) * residual
+            quadrature = torch.zeros_like(residual)
             noise = square.median() / MEDIAN_SQUARE
         in_phase, in_quadrature = rendered.variance_re + noise, rendered.variance_re + _mean(square)
         cosine, sine = math.cos(shift), math.sin(shift)

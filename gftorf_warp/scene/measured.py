@@ -96,12 +96,7 @@ def key_times(sequence: Sequence) -> Float[Tensor, "T"]:
 
 def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float[Tensor, "C P"]:
     """Values at image positions (x, y) [px], bilinear, repeated beyond the border."""
-    size = image.new_tensor([image.shape[2], image.shape[1]])
-    grid = (2.0 * points / size - 1.0)[None, None]
-    values = torch.nn.functional.grid_sample(
-        image[None], grid.to(image), padding_mode="border", align_corners=False
-    )
-    return values[0, :, 0]
+    return _sampled(image[None], points[None, None])[0, :, 0]
 
 
 def displaced(
@@ -111,8 +106,14 @@ def displaced(
     height, width = images.shape[2:]
     y, x = (torch.arange(side, device=images.device) + 0.5 for side in (height, width))
     centre = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    size = images.new_tensor([width, height])
-    grid = 2.0 * (centre + displacement.permute(0, 2, 3, 1)) / size - 1.0
+    return _sampled(images, centre + displacement.permute(0, 2, 3, 1))
+
+
+def _sampled(
+    images: Float[Tensor, "B C H W"], points: Float[Tensor, "B h w 2"]
+) -> Float[Tensor, "B C h w"]:
+    size = images.new_tensor([images.shape[3], images.shape[2]])
+    grid = (2.0 * points / size - 1.0).to(images)
     return torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 
 
